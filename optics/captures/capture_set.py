@@ -144,6 +144,8 @@ def load(path: str | Path, outside: bool = False) -> Captures:
     path = Path(path)
     path = path / FILE if path.is_dir() else path
     where, folder = str(path), path.parent
+    if path.exists() and not path.is_file():
+        raise BadCapture(f"{where}: a folder, a pipe or a device; allowed: a file; put the text of the set there")
     if not path.is_file():
         raise BadCapture(f"{where}: no such file; a capture set is a folder with {FILE}; give the folder or the file")
     data = checks.parse(path)

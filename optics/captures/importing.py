@@ -40,6 +40,7 @@ from optics.captures.capture_set import Captures, Frame
 from optics.captures.corrections import at_black, black_levels, black_text, correction, drift_text, sentences
 from optics.captures.noise import SATURATED, Noise, photon_transfer
 from optics.errors import BadCapture, OutputExists, UnknownKey
+from optics.files.archives import opened
 from optics.files.images import SUFFIXES, read_image, varied
 from optics.files.output import new_folder, shipped
 
@@ -225,7 +226,7 @@ def read_taxim(pack: str | Path) -> Presses:
         raise BadCapture(f"{path}: no such file; give the dataPack .npz of a Taxim calibration")
     wanted = ("imgs", "touch_center", "touch_radius")
     try:
-        with open(path, "rb") as raw, np.load(raw, allow_pickle=False) as data:
+        with opened(path) as data:
             missing = [key for key in wanted if key not in data.files]
             if missing:
                 raise BadCapture(
@@ -308,9 +309,13 @@ def read_circles(images: str | Path, circles: str | Path) -> Presses:
             raise BadCapture(
                 f"{where}: no image '{name}' in {folder}; allowed: {', '.join(SUFFIXES)} files of that folder"
             )
+        if not file.resolve().is_relative_to(folder.resolve()):
+            raise BadCapture(f"{where}: '{name}' lies outside {folder}; allowed: files of that folder; copy it there")
         images_read.append(_colour_image(file, f"{where}: {name}", images_read[0].shape if images_read else None))
-        names.append(Path(name).stem)
+        names.append(name)
         found.append(numbers)
+    stems = [Path(name).stem for name in names]
+    names = stems if len(set(stems)) == len(stems) else [f"{i:03d}" for i in range(len(stems))]
     return Presses(f"{folder} with {table}", names, np.stack(images_read), np.array(found))
 
 

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from optics.errors import Underdetermined
+from optics.scene.parameter import LARGEST
 
 if TYPE_CHECKING:
     from optics.captures.capture_set import Captures, Frame
@@ -93,6 +94,10 @@ class Noise:
             for value in own if isinstance(own, tuple) else (own,):
                 if not math.isfinite(value) or (allowed != "finite" and value < 0) or (allowed == "> 0" and value == 0):
                     raise ValueError(f"{name} = {value:g} {unit}; allowed: {allowed}; see the camera's EMVA 1288 sheet")
+                if abs(value) > LARGEST:
+                    raise ValueError(
+                        f"{name} = {value:g} {unit} is beyond what can be computed with; allowed: up to {LARGEST:g}"
+                    )
         if self.saturation <= self.black_level:
             raise ValueError(f"saturation = {self.saturation:g} DN; allowed: > black_level = {self.black_level:g} DN")
 

@@ -23,7 +23,9 @@ def parse(file: Path) -> dict:
     """The file's content, with or without a byte order mark; raises BadCapture with line and column."""
     try:
         return tomllib.loads(file.read_text(encoding="utf-8-sig"))
-    except (ValueError, RecursionError) as error:  # TOMLDecodeError, UnicodeDecodeError, a number too long
+    except UnicodeDecodeError as error:
+        raise BadCapture(f"{file}: byte {error.start} is no UTF-8 ({error.reason}); save the file as UTF-8") from error
+    except (ValueError, RecursionError) as error:  # TOMLDecodeError, a number too long
         raise BadCapture(f"{file}: not valid TOML: {error}; correct this line (text needs quotes)") from error
 
 

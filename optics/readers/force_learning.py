@@ -29,6 +29,7 @@ from typing import Any
 
 import numpy as np
 
+from optics.files.archives import opened
 from optics.files.output import replacing
 
 FORMAT = 1  # of the files
@@ -321,7 +322,7 @@ def _read(file: str | Path, wanted: tuple[str, ...], maker: str, more: bool = Fa
     if not Path(file).is_file():
         raise FileNotFoundError(f"{file}: no such file; make it with {maker}")
     try:
-        with open(file, "rb") as raw, np.load(raw, allow_pickle=False) as data:
+        with opened(file) as data:
             note = json.loads(str(data["note"]))
             arrays = {name: data[name] for name in (data.files if more else wanted) if name != "note"}
         if note["format"] != FORMAT or any(arrays[name].dtype.kind != "f" for name in arrays):

@@ -93,8 +93,8 @@ def find(
 
     What each step is for:
       background   the opening by a square of `largest`: brightness that is wider than any marker, taken off
-      homogeneity     what is left is divided by its maximum within `largest` around, so that lamps may leave one side
-                      dimmer
+      homogeneity  what is left is divided by its maximum within `largest` around, so that lamps may leave one side
+                   dimmer
       threshold    Otsu's, and no lower than 5 sd of the noise
       extent       above half of each candidate's own peak; 9 px at least, and whole: what the image border cuts is left
                    out
@@ -105,6 +105,8 @@ def find(
     in. Raises ValueError for another shape, for values that are not finite and for settings out of range."""
     grey = _grey(image)
     height, width = grey.shape
+    if largest is None and min(height, width) < 15:
+        raise ValueError(f"{width} x {height} pixels; allowed: 15 each way or more, of which a marker may take a fifth")
     largest = min(height, width) / 5 if largest is None else float(largest)
     if not (3 <= largest <= min(height, width)):
         raise ValueError(

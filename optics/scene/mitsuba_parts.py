@@ -43,10 +43,16 @@ def use_variant(variant: str = DEFAULT_VARIANT, registry: Registry | None = None
     _refuse_scalar(variant)
     if variant.startswith("llvm"):
         require_llvm()
+    import drjit as dr
     import mitsuba as mi
 
     if variant not in mi.variants():
         raise UnknownKey(variant, [v for v in mi.variants() if not v.startswith("scalar")], "variant")
+    if variant.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
+        raise ValueError(
+            f"variant {variant}: no NVIDIA GPU that Dr.Jit can use; allowed: {variant.replace('cuda', 'llvm', 1)}; "
+            "`optics doctor` lists the variants of this machine"
+        )
     if mi.variant() != variant:
         try:
             mi.set_variant(variant)

@@ -203,11 +203,13 @@ class Parameter:
                 )
             return str(value)
         try:
+            if isinstance(value, (str, bytes, bool)):  # "1.0" in quotes would be kept as text where it is stored
+                raise TypeError
             number = float(value)
         except (TypeError, ValueError):
             raise ValueError(
                 f"{where + ': ' if where else ''}{key} = {value!r} is not a "
-                f"number{f' in {self.unit}' if spaced(self.unit) else ''}"
+                f"number{f' in {self.unit}' if spaced(self.unit) else ''}; allowed: a number, without quotes or unit"
             ) from None
         if not math.isfinite(number):
             raise ValueError(f"{where + ': ' if where else ''}{key} = {number}{spaced(self.unit)} is not finite")

@@ -41,6 +41,7 @@ STRETCH = ("stretch", "stretch_x", "stretch_y", "stretch_xx", "stretch_xy", "str
 SHAPES = ("sphere", "cylinder", "cube", "balls")
 MESH_FILES = (".stl", ".obj", ".ply")
 FILES = (*MESH_FILES, *MAP_FILES)
+FARTHEST = 1e4  # mm, of a mesh: no indenter is larger, and the samples along longer sides would fill the memory
 FLATTEST = 0.05  # slope that softens the contact edge of flat faces: a twentieth of a pitch of height
 STEPS = (10, 24)  # directions from which a parallel face is found: towards the face's normal, and around it
 HALVINGS = 40  # of a quarter turn: 1e-12 rad
@@ -626,6 +627,11 @@ def _mesh_samples(path, stamp, rotation, extent, pitch, slope):
         raise ValueError(f"indenter mesh {path}: cannot be read ({type(error).__name__}: {error})") from error
     if not len(triangles) or triangles.shape[1:] != (3, 3) or not np.isfinite(triangles).all():
         raise ValueError(f"indenter mesh {path}: no triangles with finite corners; export a triangle mesh in mm")
+    if np.abs(triangles).max() > FARTHEST:
+        raise ValueError(
+            f"indenter mesh {path}: a corner {np.abs(triangles).max():.3g} mm from its origin; allowed: up to "
+            f"{FARTHEST:g} mm; export it in mm, about its tip"
+        )
     triangles = triangles @ rotation_matrix(*rotation).T
     triangles[..., 2] -= triangles[..., 2].min()
     n = 2 * math.ceil(extent / pitch) + 1

@@ -85,13 +85,27 @@ class HeldSkin:
             return found
 
         bonded = moved(face[[(nx // 2) * ny + ny // 2]], solver(skin, 0.0, FORMS[0], base | skin.held))[0]
-        found = moved(face, solver(skin, self.springs, FORMS[0], skin.held)).reshape(nx, ny, nx, ny, nz, 3)
+        quarter = face.reshape(nx, ny)[: (nx + 1) // 2, : (ny + 1) // 2]
+        found = np.empty((nx, ny, nx, ny, nz, 3))
+        found[: quarter.shape[0], : quarter.shape[1]] = moved(
+            quarter.ravel(), solver(skin, self.springs, FORMS[0], skin.held)
+        ).reshape(*quarter.shape, nx, ny, nz, 3)
+        self._mirror(found, axis)
         for i in range(nx):
             for j in range(ny):  # of a layer without end, the motion about any load is that about the middle
                 x, y = ((max(0, a), min(n, n + a)) for a, n in ((i - nx // 2, nx), (j - ny // 2, ny)))
                 here = found[i, j, slice(*x), slice(*y)]
                 here -= bonded[x[0] - i + nx // 2 : x[1] - i + nx // 2, y[0] - j + ny // 2 : y[1] - j + ny // 2]
         return np.ascontiguousarray(found.transpose(1, 0, 4, 3, 2, 5).reshape(nx * ny, nz, ny, nx, 3))
+
+    @staticmethod
+    def _mirror(found: np.ndarray, axis: int) -> None:
+        """Fill in the loads beyond the first quarter: the skin is its own mirror image along x and along y."""
+        for along in (0, 1):
+            loads = np.moveaxis(found, along, 0)
+            n = len(loads)
+            signs = np.where(np.arange(3) == along, -1.0, 1.0) * (-1.0 if axis == along else 1.0)
+            loads[(n + 1) // 2 :] = np.flip(loads[: n // 2][::-1], 2 + along) * signs
 
     @cached_property
     def splines(self) -> tuple[Any, Any]:

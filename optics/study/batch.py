@@ -381,6 +381,7 @@ class Maker:
         return {
             **{key: {"unit": p.unit, "doc": p.doc} for key, p in found.items()},
             **{f"labels.{name}": told for name, told in labels.items()},
+            **({"unit": {"unit": "", "doc": "number of the sensor in the series"}} if self.draws.serial else {}),
         }
 
     def make(self, index: int) -> dict:
@@ -422,10 +423,7 @@ class Maker:
         from optics.files.images import write_image
 
         frame = self.exposed(image.camera, self.job.rng(index, f"noise {stem.name}"))
-        path = stem.with_name(stem.name + "-dn.png")
-        with replacing(path) as temporary:
-            write_image(temporary.with_name(temporary.stem), frame, 8 if self.noise.saturation <= 255 else 16)
-        return path
+        return write_image(stem.with_name(stem.name + "-dn"), frame, 8 if self.noise.saturation <= 255 else 16)
 
     def exposed(self, camera: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """(H, W, C) whole DN of what the camera makes of an image, with noise and its fixed pattern."""
@@ -518,7 +516,8 @@ def _write_table(job: Job, blocks: Blocks) -> None:
         told: list[str] = []
         roles: list[str] = []
         for record in blocks.records():
-            values = {**job.parameters, **record["sample"]}
+            unit = {"unit": record["unit"]} if "unit" in record else {}
+            values = {**unit, **job.parameters, **record["sample"]}
             labels = labelling.flat(record.get("labels", {}))
             files = record["files"]
             if not keys:

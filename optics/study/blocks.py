@@ -281,7 +281,7 @@ class Blocks:
         """Remove what workers that died left of the shard's samples, but for blocks that somebody is at."""
         left: dict[int, list[Path]] = {}
         for file in (self.folder / "images").glob(".*"):
-            index = file.name[1:].split(".")[0].split("-")[0]
+            index = file.name.lstrip(".").split(".")[0].split("-")[0]
             if index.isdecimal() and int(index) // self.size in self.numbers:
                 left.setdefault(int(index) // self.size, []).append(file)
         for number, files in left.items():

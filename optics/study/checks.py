@@ -37,7 +37,7 @@ def of_captures(model: SceneModel) -> list[str]:
     from optics.light.rendering import veiled
 
     texts = [*model.captures.warnings, *warnings_of(model.noise, model.captures), *_unnamed(model), *_astray(model)]
-    texts += without_shading(model)
+    texts += [*without_shading(model), *the_same(model)]
     if model.cut_off:
         count = sum(int((f.image == 0).sum()) for f in model.frames)
         texts.append(
@@ -149,6 +149,25 @@ def without_shading(model: SceneModel) -> list[str]:
     return [
         f"{len(found)} of {len(model.frames)} images hold one value everywhere, such as '{name}', where every value is "
         f"{value:g} DN: nothing in them tells one model from another. Look at the files, or leave these frames out"
+    ]
+
+
+def the_same(model: SceneModel) -> list[str]:
+    """Images of the same pixels under other names: noise gives no camera the same image twice."""
+    first: dict[bytes, str] = {}
+    pairs = []
+    for f in model.frames if model.captures.values_are == "DN" else ():
+        values = f.image[np.isfinite(f.image)]
+        if f.readings or values.size < 2 or values.min() == values.max():
+            continue
+        twin = first.setdefault(np.ascontiguousarray(f.image).tobytes(), f.name)
+        if twin != f.name:
+            pairs.append((twin, f.name))
+    if not pairs:
+        return []
+    return [
+        f"{len(pairs)} of {len(model.frames)} images have the pixels of another one, such as '{pairs[0][1]}' those of "
+        f"'{pairs[0][0]}': one reading counts as two. Look at the files, and leave copies out"
     ]
 
 

@@ -29,6 +29,7 @@ from pydantic import BaseModel, Field, RootModel, ValidationError, model_validat
 
 from optics.errors import OutputExists, UnknownKey
 from optics.files import exr
+from optics.files.archives import opened
 from optics.files.images import read_array
 from optics.files.output import check_folder, file_hash, replacing, write_json, write_text
 from optics.light import labels as labelling
@@ -228,7 +229,7 @@ def _table(file: Path, form: type[BaseModel]) -> dict[str, Any]:
 def _arrays(file: Path, kind: str, images: str) -> dict[str, np.ndarray]:
     """What one file of a sample gives, name -> array."""
     if file.suffix == ".npz":
-        with open(file, "rb") as raw, np.load(raw, allow_pickle=False) as arrays:
+        with opened(file) as arrays:
             return {NODES + name: arrays[name] for name in arrays.files}
     if file.suffix == ".npy":
         return {kind: np.load(file, allow_pickle=False)}
@@ -834,9 +835,13 @@ def _episode(batch: Batch) -> int:
 # -- the card --------------------------------------------------------------------------------------------------------
 def _card(plan: Plan, identity: Mapping, moments: Moments, pattern: str, licence: str) -> dict[str, Any]:
     made, job = plan.batch.made, plan.batch.job
+    named = {**job["sample"], **job.get("unit", {})}
+    jointly = [f"the effect {name}" for name in named if "." not in name]  # which stands for its parameters
+    jointly += ["the posterior of the calibration"] * bool(job.get("posterior"))
+    sampled = next(plan.batch.records())["sample"]
     values = {}
     for key in plan.first.values:
-        drawn = job["sample"].get(key) or job.get("unit", {}).get(key)
+        drawn = named.get(key) or ({"with": " or ".join(jointly)} if key in sampled and jointly else None)
         values[key] = {
             **described(plan.batch, key),
             "drawn": {k: v for k, v in drawn.items() if v is not None} if drawn else None,

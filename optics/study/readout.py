@@ -68,9 +68,9 @@ def markers(
     rows: list[Row] = []
     at_rest = None
     if rest is not None:
-        at_rest = _ordered(marker_reader.find(read_image(rest, str(rest))[0], count), grid, str(rest)).centres
+        at_rest = _ordered(_found(read_image(rest, str(rest))[0], count, str(rest)), grid, str(rest)).centres
     for name, image in _each(files, "markers", progress):
-        found = marker_reader.find(image, count)
+        found = _found(image, count, name)
         if at_rest is not None:
             moved = marker_reader.match(at_rest, found)
             for i, (place, move) in enumerate(zip(at_rest, moved)):
@@ -89,6 +89,13 @@ def markers(
             )
             rows.append({"file": name, "marker": i, **numbers})
     return rows
+
+
+def _found(image: np.ndarray, count: int | None, name: str) -> marker_reader.Markers:
+    try:
+        return marker_reader.find(image, count)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
 
 
 def _ordered(found: marker_reader.Markers, grid: tuple[int, int] | None, name: str) -> marker_reader.Markers:

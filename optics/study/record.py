@@ -38,6 +38,7 @@ from optics import words
 from optics.diagnosis.result import Diagnosis, table_of
 from optics.diagnosis.result import Row as Ranked
 from optics.errors import BadCapture, OutputExists, UnknownKey
+from optics.files.archives import opened
 from optics.files.output import alone, file_hash, input_hashes, new_folder, replacing, versions, write_text
 from optics.fit.compare import Comparison, Row, plain
 from optics.fit.result import Fit
@@ -504,7 +505,7 @@ def _read(file: Path) -> dict:
 def _arrays(file: Path) -> Iterator[Any]:
     """The arrays of a step's file. Raises ValueError, which names it."""
     try:
-        with open(file, "rb") as raw, np.load(raw, allow_pickle=False) as arrays:  # by name numpy leaves bad files open
+        with opened(file) as arrays:
             yield arrays
     except DAMAGED as error:
         raise ValueError(f"{file}: damaged or cut off ({error}); restore it, or start a new study") from error

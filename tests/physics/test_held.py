@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from optics.skin import contact, held, pressing
-from optics.skin.composite import Skin
+from optics.skin.composite import FORMS, Skin, solver
 from optics.skin.contact import local_axis
 from optics.skin.held import HeldContact, HeldSkin
 
@@ -29,6 +29,20 @@ def pressed(skin, pressure, pitch, place):
     return HeldContact(
         none, pressure, np.zeros((n, n, 2)), none.astype(bool), pitch, (skin.layer,), skin=skin, place=place
     )
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_loads_beyond_the_first_quarter_are_mirror_images(axis):
+    """What is not solved for is what it would be, to rounding."""
+    skin = Skin((10.0, 8.0, 5.0), (4, 6, 4), 0.04, 0.49, 2)
+    nx, ny, nz = skin.shape
+    loads = np.zeros((3 * len(skin.nodes), nx * ny))
+    loads[3 * skin.layer(0) + axis, np.arange(nx * ny)] = 1.0
+    whole = solver(skin, 0.003, FORMS[0], skin.held)(loads).T.reshape(nx, ny, nx, ny, nz, 3)
+    part = whole.copy()
+    part[(nx + 1) // 2 :] = part[:, (ny + 1) // 2 :] = np.nan
+    HeldSkin._mirror(part, axis)
+    np.testing.assert_allclose(part, whole, rtol=0, atol=1e-9 * np.abs(whole).max())
 
 
 @pytest.mark.slow  # half a minute of scikit-fem

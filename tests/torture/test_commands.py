@@ -39,7 +39,7 @@ BASE = {
     "calibrate": "readings -o out/study",
     "locate": "images -o out/beads.csv",
     "diagnose": "study",
-    "add": "study vignetting",
+    "add": "study extinction-leak",
     "report": "study -o out/page.html",
     "values": "study",
     "plot-spectra": "digit -o out/spectra.png",
@@ -238,6 +238,33 @@ def test_images_without_shading_are_named(place, capsys, monkeypatch, level, cod
     assert said in capsys.readouterr().err
 
 
+def test_copies_of_an_image_are_named(place, capsys, monkeypatch):
+    monkeypatch.chdir(place)
+    (place / "images" / "b.png").write_bytes((place / "images" / "a.png").read_bytes())
+    file = place / "images" / "captures.toml"
+    file.write_text(file.read_text().replace('repeats = ["c.png"]\n', ""))
+    assert main(["compare", "images"]) == 0
+    assert "1 of 2 images have the pixels of another one, such as 'b' those of 'a'" in capsys.readouterr().err
+
+
+def test_tables_of_circles_name_images_of_their_folder(place, met, monkeypatch):
+    monkeypatch.chdir(place)
+    rng = np.random.default_rng(0)
+    (place / "presses" / "more").mkdir(parents=True)
+    names = ["a.png", "b.png", "more/a.png", "c.png", "d.png"]
+    for name in names:
+        Image.fromarray(rng.integers(90, 110, (24, 32, 3)).astype(np.uint8)).save(place / "presses" / name)
+    shutil.copy(place / "presses" / "a.png", place / "other.png")
+    words = "import presses --circles c.csv --ball-radius 2 --mm-per-pixel 0.1 -o set"
+    for last, code in (("../other.png", 2), (str(place / "other.png"), 2), ("d.png", 0)):
+        rows = "".join(f"{name},16,12,4\n" for name in (*names[:4], last))
+        (place / "c.csv").write_text("file,center_x_px,center_y_px,contact_radius_px\n" + rows)
+        found, said = met(*words.split())
+        assert found == code and (code == 0 or f"'{last}' lies outside presses" in said), said
+    frames = sorted((place / "set" / "frames").iterdir())
+    assert len(frames) == 5 and len({f.read_bytes() for f in frames}) == 5  # two of them are called 'a'
+
+
 @pytest.mark.slow
 def test_a_tactile_scene_takes_a_stock_camera(place, met, monkeypatch):
     monkeypatch.chdir(place)
@@ -272,7 +299,7 @@ WRITING = [
     "design small.xml -n 2 -o out/plan",
     "report study -o out/page.html",
     "diagnose study",
-    "add study vignetting",
+    "add study extinction-leak",
     "effects new ripple -o out/own",
     "effects new ripple --from study --along signal",
 ]

@@ -525,7 +525,7 @@ def test_missing_sets_and_other_encodings(tmp_path):
     with pytest.raises(BadCapture, match="no such file; a capture set is a folder"):
         captures.load(tmp_path / "nowhere")
     (tmp_path / "captures.toml").write_bytes(b'scene = "\xff"\n')
-    with pytest.raises(BadCapture, match="not valid TOML"):
+    with pytest.raises(BadCapture, match="byte 9 is no UTF-8"):
         captures.load(tmp_path)
 
 

@@ -114,6 +114,7 @@ JOBS = {
     "dark": JOB + "[noise]\nprnu = 0.0\n",
     "define": JOB + "[defines]\nwidht = 20\n",
     "fixed": JOB + '[parameters]\n"gel.press_z" = 1\n',
+    "quoted": JOB + '[parameters]\n"gel.press_x" = "1.0"\n',
     "unquoted": JOB + "[parameters]\ngel.press_x = 1\n",
     "both": JOB + '[parameters]\n"gel.press_x" = 1\n' + DRAW.format("uniform = [0, 1]"),
     "unquoted_sample": JOB + "[sample]\ngel.press_x = { uniform = [0, 1] }\n",
@@ -159,6 +160,8 @@ def capture_sets(folder):
         "mask": head + NOISE + frames + 'mask = "black.png"\n',
         "photo": head + NOISE + frames.replace("b.png", "photo.png"),
         "setting": head + NOISE + frames + '[frames.parameters]\n"led_7.power" = 1.0\n',
+        "quoted": head + NOISE + frames + '[frames.parameters]\n"led_1.power" = "1.0"\n',
+        "gain": head + NOISE.replace("system_gain = 0.05", "system_gain = 1e308") + frames,
         "beyond": head + NOISE + frames + '[frames.parameters]\n"gel.press_depth" = -1.0\n',
         "silent": head + frames,
         "half": head + NOISE.replace("prnu = 0.0\n", "") + frames,
@@ -188,7 +191,9 @@ def place(tmp_path_factory):
     for name, text in broken_scenes(good).items():
         (folder / f"{name}.xml").write_text(text, encoding="utf-8")
     (folder / "wide.xml").write_text(good, encoding="utf-16")
+    (folder / "wide.toml").write_text(JOB, encoding="utf-16")
     (folder / "folder.xml").mkdir()
+    (folder / "captures" / "folder" / "captures.toml").mkdir(parents=True)
     for name, (file, text) in PLUGINS.items():
         (folder / "plugins_" / name).mkdir(parents=True)
         (folder / "plugins_" / name / file).write_text(text, encoding="utf-8")
@@ -216,6 +221,7 @@ def place(tmp_path_factory):
             (own / f"{table}.csv").write_text(rows)
         shutil.copy(own / "a.png", own / "b.jpg")
         np.save(own / "nan.npy", np.full((SIZE[1], SIZE[0], 3), np.nan, np.float32))
+    (folder / "far.obj").write_text("v 0 0 0\nv 1e30 0 1\nv 0 1e30 1\nf 1 2 3\n")
     (folder / "fit.toml").write_text('[parameters]\n"led_9.x" = 1.0\n')
     (folder / "fit_frame.toml").write_text('[parameters]\n[frames.z]\n"gel.press_x" = 1.0\n')
     (folder / "fit_torn.toml").write_text("[parameters\n")
@@ -279,6 +285,8 @@ CASES = [
     ("params small.xml -D indenter=sphare", r"small\.xml: line \d+.*'sphare'; did you mean 'sphere'"),
     ("params small.xml --variant scalar_rgb", r"scalar variants are not supported; use llvm"),
     ("params small.xml --variant llvm_ad_rbg", r"unknown variant 'llvm_ad_rbg'; did you mean 'llvm_ad_rgb'"),
+    ("read markers captures/good/small.png", r"good/small\.png: 10 x 10 pixels; allowed: 15 each way or more"),
+    (f"{RENDER} -D indenter=far.obj", r"indenter mesh .*far\.obj: a corner 1e\+30 mm from its origin; allowed: up to"),
     (f"{RENDER} --set gel.press_z=1", r"--set: unknown parameter 'gel\.press_z'; did you mean 'gel\.press_"),
     (f"{RENDER} --set gel.press_x", r"--set gel\.press_x: no '='"),
     (f"{RENDER} --set gel.press_depth=0.5mm", r"--set: gel\.press_depth = '0\.5mm' is not a number in mm"),
@@ -312,6 +320,7 @@ CASES = [
     # jobs
     ("batch absent.toml", r"absent\.toml: no such job file"),
     ("batch toml.toml", r"toml\.toml: not valid TOML.*line 1"),
+    ("batch wide.toml", r"wide\.toml: byte 0 is no UTF-8.*; save the file as UTF-8"),
     ("batch key.toml", r"key\.toml: unknown key 'lihgts'; did you mean 'lights'"),
     ("batch missing.toml", r"missing\.toml: out is missing; allowed: a folder"),
     ("batch negative.toml", r"negative\.toml: count = -3; allowed: a whole number from 1"),
@@ -332,6 +341,10 @@ CASES = [
         r"unquoted\.toml: \[parameters\]: gel is a table; a key with a dot needs quotes: \"gel\.press_x\"",
     ),
     ("batch unquoted_sample.toml", r"\[sample\]: gel is a table; a key with a dot needs quotes: \"gel\.press_x\""),
+    (
+        "batch quoted.toml",
+        r"quoted\.toml: \[parameters\]: gel\.press_x = '1\.0' is not a number in mm; allowed: .* without quotes",
+    ),
     ("batch both.toml", r"both\.toml: gel\.press_x stands in \[parameters\] and in \[sample\]"),
     ("batch sample.toml", r"sample\.toml: \[sample\]: unknown parameter 'gel\.press_z'"),
     ("batch shape.toml", r"shape\.toml: \[sample\].*'unifrom'; did you mean 'uniform'"),
@@ -369,6 +382,9 @@ CASES = [
     ("compare captures/photo", r"frame 1.*a JPEG by the name of \.png"),
     ("compare captures/mask", r"frame 1.*mask.*empty"),
     ("compare captures/setting", r"frame 1.*unknown parameter 'led_7\.power'; did you mean 'led_"),
+    ("compare captures/quoted", r"frame 1 .*led_1\.power = '1\.0' is not a number; allowed: .* without quotes"),
+    ("compare captures/gain", r"\[noise\]: system_gain = 1e\+308 .* beyond what can be computed with; allowed: up to"),
+    ("compare captures/folder", r"captures\.toml: a folder, a pipe or a device; allowed: a file"),
     ("compare captures/beyond", r"frame 1.*gel\.press_depth = -1 mm is outside its bounds"),
     (
         "compare captures/silent",
@@ -450,3 +466,13 @@ def test_one_line_and_nothing_written(place, monkeypatch, capsys, arguments, exp
     assert "Traceback" not in said.err and said.out == ""
     assert standing(place) == before
     assert not Path("/proc/none").exists()
+
+
+def test_a_gpu_that_is_not_there(place, monkeypatch, capsys):
+    import drjit as dr
+
+    monkeypatch.chdir(place)
+    monkeypatch.setattr(dr, "has_backend", lambda backend: False)
+    assert main(["params", "small.xml", "--variant", "cuda_ad_rgb"]) == 2
+    said = capsys.readouterr().err
+    assert "variant cuda_ad_rgb: no NVIDIA GPU that Dr.Jit can use; allowed: llvm_ad_rgb" in said, said

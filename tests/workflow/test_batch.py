@@ -312,7 +312,8 @@ def test_killed_in_the_middle_and_resumed(whole, job, start):
             time.sleep(0.05)
     done = recorded(out)
     assert len(workers) >= 2 and 3 <= done < TOTAL
-    (out / "images" / ".000009.0123456789abcdef.exr").write_bytes(b"half an image")  # as a kill in mid-write leaves it
+    for name in (".000009.0123456789abcdef.exr", "..000009-dn.0123.4567.png"):  # as a kill in mid-write leaves them
+        (out / "images" / name).write_bytes(b"half an image")
     with open(out / ".parts" / "00009.part", "a") as file:
         file.write('{"index": 9, "sam')
     result = batch.run(job, workers=1)

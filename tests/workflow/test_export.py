@@ -4,6 +4,7 @@ import hashlib
 import io
 import json
 import math
+import os
 import shutil
 import subprocess
 import sys
@@ -132,7 +133,7 @@ def test_arrays_of_a_tar_are_npy(made, tmp_path):
 
 
 def test_lerobot(made, tmp_path):
-    """Read by pyarrow; the library itself, which brings torch, reads it too (docs/batches.md says which version)."""
+    """Read by pyarrow; the library itself, which brings torch, in the next test."""
     export.export(made, tmp_path / "x", "lerobot", per_file=4)
     info = json.loads((tmp_path / "x/meta/info.json").read_text())
     episodes = parquet.read_table(tmp_path / "x/meta/episodes").to_pylist()
@@ -157,6 +158,31 @@ def test_lerobot(made, tmp_path):
     pixels = np.stack([png(made, i) for i in range(TOTAL)]) / 255.0
     np.testing.assert_allclose(np.ravel(stats["mean"]), pixels.mean((0, 1, 2)), rtol=1e-12)
     np.testing.assert_allclose(np.ravel(stats["std"]), pixels.std((0, 1, 2)), rtol=1e-9)
+
+
+READ_BY_LEROBOT = """
+import sys
+import numpy as np
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from PIL import Image
+
+data = LeRobotDataset("local/made", root=sys.argv[1])
+for i, sample in enumerate(data):
+    image = np.round(np.asarray(sample["observation.images.camera"]).transpose(1, 2, 0) * 255)
+    assert (image == np.asarray(Image.open(f"{sys.argv[2]}/images/{i:06d}.png"))).all(), i
+    assert (int(sample["episode_index"]), int(sample["frame_index"])) == (i // 3, i % 3)
+print(len(data), data.num_episodes)
+"""
+
+
+@pytest.mark.skipif("OPTICS_LEROBOT" not in os.environ, reason="OPTICS_LEROBOT names no Python that has lerobot")
+def test_lerobot_itself_reads_what_was_written(made, tmp_path):
+    """In a Python of its own: its packages and ours do not go together."""
+    export.export(made, tmp_path / "x", "lerobot", per_file=4)
+    words = [os.environ["OPTICS_LEROBOT"], "-c", READ_BY_LEROBOT, str(tmp_path / "x"), str(made)]
+    own = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    done = subprocess.run(words, capture_output=True, text=True, timeout=600, env=own)
+    assert done.stdout.split() == [str(TOTAL), "2"], done.stderr
 
 
 def test_a_single_number_of_lerobot_is_no_list(tmp_path):
@@ -297,6 +323,22 @@ def test_the_card_says_where_the_data_come_from(made, tmp_path):
     assert again["licence"] == "CC0-1.0" and "- licence: CC0-1.0" in (tmp_path / "x/card.md").read_text()
     assert export.export(made, tmp_path / "x", "webdataset") == again, "a licence that was stated stays"
     assert "CC-BY-4.0" in page and "| gel.press_x | mm | uniform [-4.0, 4.0] |" in page and "sphere (" in page
+
+
+def test_a_series_of_sensors_is_told_in_table_and_card(tmp_path):
+    """Who splits a set by sensors needs their numbers; what an effect draws is not 'fixed'."""
+    (tmp_path / "job.toml").write_text(
+        'scene = "gelsight"\nout = "out"\ncount = 4\nper_unit = 2\noutputs = ["png"]\n'
+        '[defines]\nwidth = 20\nheight = 16\n[unit]\n"lens vignetting" = { plausible = 1 }\n'
+    )
+    made = batch.run(tmp_path / "job.toml", workers=1).folder
+    rows = [line.split(",") for line in (made / "manifest.csv").read_text().splitlines()]
+    assert rows[0][:3] == ["index", "unit", "camera.vignetting"]
+    assert [row[1] for row in rows[1:]] == ["0", "0", "1", "1"] and rows[1][2] == rows[2][2] != rows[3][2]
+    export.export(made, tmp_path / "x", "hdf5")
+    card = (tmp_path / "x" / "card.md").read_text()
+    assert "| camera.vignetting | 1 | with the effect lens vignetting |" in card, card
+    assert "| unit |  | fixed, or a label | 0 to 1, mean 0.5 | number of the sensor in the series |" in card
 
 
 def test_an_image_of_another_sample_is_refused(made, tmp_path):
