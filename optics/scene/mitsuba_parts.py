@@ -49,27 +49,14 @@ def use_variant(variant: str = DEFAULT_VARIANT, registry: Registry | None = None
     if variant not in mi.variants():
         raise UnknownKey(variant, [v for v in mi.variants() if not v.startswith("scalar")], "variant")
     if variant.startswith("cuda") and not dr.has_backend(dr.JitBackend.CUDA):
-        raise ValueError(
+        raise PlatformError(
             f"variant {variant}: no NVIDIA GPU that Dr.Jit can use; allowed: {variant.replace('cuda', 'llvm', 1)}; "
-            "`optics doctor` lists the variants of this machine"
+            f"leave --variant and {VARIABLE} away, or see `optics doctor` for the variants of this machine"
         )
     if mi.variant() != variant:
-        try:
-            mi.set_variant(variant)
-        except ImportError as error:
-            raise _unusable(variant) from error
+        mi.set_variant(variant)
         mi.set_log_level(mi.LogLevel.Error)
     _prepare(registry or default(), variant)
-
-
-def _unusable(variant: str) -> PlatformError:
-    """Where Mitsuba has a variant that this machine cannot run."""
-    if variant.startswith("cuda"):
-        return PlatformError(
-            f"variant {variant}: Dr.Jit finds no NVIDIA driver here; allowed: variants that begin with llvm; "
-            f"next: see whether `nvidia-smi` lists a device, or leave {VARIABLE} and --variant away"
-        )
-    return PlatformError(f"variant {variant} does not start on this machine; next: optics doctor")
 
 
 def register(plugins: str | Path | list[str | Path] | None = None) -> None:

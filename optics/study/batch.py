@@ -484,8 +484,10 @@ PATIENCE = 10.0  # s for another command to write its manifest, also where a fil
 
 
 def finish(job: Job, blocks: Blocks) -> bool:
-    """Write one ordered manifest and its table once every sample of the job is recorded; whether it is."""
-    if not blocks.finished:
+    """Write one ordered manifest and its table once every sample of the job is recorded; whether it is.
+
+    One worker does it, and the others wait for it: whoever ends first removes the records that the table is made of."""
+    while not blocks.finished:
         if len(blocks.complete()) < blocks.count:
             return False
         try:
@@ -495,9 +497,9 @@ def finish(job: Job, blocks: Blocks) -> bool:
                         file.unlink(missing_ok=True)
                 if not blocks.finished:
                     _write_table(job, blocks)
-                blocks.finish()
-        except OutputExists:
-            pass  # another worker is at it
+                    blocks.finish()
+        except OutputExists:  # another worker is at it; the lock is free if that one dies
+            time.sleep(PATIENCE / 50)
         except FileNotFoundError:  # `.parts` is gone, or, where a file system has no locks, what was being written
             until = time.monotonic() + PATIENCE
             while not blocks.finished:  # another command has been at it, or is
@@ -515,6 +517,7 @@ def _write_table(job: Job, blocks: Blocks) -> None:
         keys: list[str] = []
         told: list[str] = []
         roles: list[str] = []
+        written = 0
         for record in blocks.records():
             unit = {"unit": record["unit"]} if "unit" in record else {}
             values = {**unit, **job.parameters, **record["sample"]}
@@ -525,6 +528,9 @@ def _write_table(job: Job, blocks: Blocks) -> None:
                 writer.writerow(["index", *keys, *told, *roles])
             row = (*(values[k] for k in keys), *(labels.get(k) for k in told), *(files[r]["file"] for r in roles))
             writer.writerow([record["index"], *row])
+            written += 1
+        if written < blocks.total:
+            raise FileNotFoundError(f"{blocks.parts}: records of {written} samples of {blocks.total}")
 
 
 # -- the work --------------------------------------------------------------------------------------------------------

@@ -606,17 +606,3 @@ def test_painted_edges_are_as_smooth_as_those_of_shapes(mitsuba):
     fine = rendered(384).reshape(36, 8, 48, 8)
     assert np.abs(rendered(48) - fine.mean((1, 3))).max() < 0.05 * fine.max()
     assert fine.std((1, 3)).max() > 0.1 * fine.max()  # there are edges
-
-
-def test_a_variant_that_the_machine_cannot_run_is_refused_in_words(monkeypatch):
-    import mitsuba as mi
-
-    from optics.doctor import PlatformError
-    from optics.scene.mitsuba_parts import use_variant
-
-    def without_driver(variant):
-        raise ImportError("the CUDA backend hasn't been initialized")
-
-    monkeypatch.setattr(mi, "set_variant", without_driver)
-    with pytest.raises(PlatformError, match="variant cuda_ad_mono: Dr.Jit finds no NVIDIA driver.*nvidia-smi"):
-        use_variant("cuda_ad_mono")

@@ -498,6 +498,39 @@ def test_commands_at_once_share_the_work(whole, job, start):
     assert content(out) == content(whole)
 
 
+def test_who_finishes_is_waited_for(job, monkeypatch):
+    """Another command is at the table: this one leaves it the records that it is made of."""
+    out, began = job.parent / "out", threading.Event()
+    write, done = batch._write_table, []
+
+    def slow(own, blocks):
+        began.set()
+        second = threading.Thread(target=lambda: done.append(batch.finish(own, Blocks(out, TOTAL))))
+        second.start()
+        second.join(0.5)
+        assert second.is_alive() and not blocks.manifest.exists() and len(blocks.complete()) == blocks.count
+        write(own, blocks)
+        waiting.append(second)
+
+    waiting: list[threading.Thread] = []
+    monkeypatch.setattr(batch, "_write_table", slow)
+    assert batch.run(job, workers=1).complete and began.is_set()
+    waiting[0].join(10)
+    assert done == [True]
+    assert len((out / "manifest.csv").read_text().splitlines()) == TOTAL + 1
+    assert len((out / "manifest.jsonl").read_text().splitlines()) == TOTAL and not (out / ".parts").exists()
+
+
+def test_a_table_lacks_no_sample(job, monkeypatch):
+    """Records that another command sweeps away meanwhile are missed before the table is kept."""
+    records = Blocks.records
+    monkeypatch.setattr(Blocks, "records", lambda self: list(records(self))[:-1])
+    monkeypatch.setattr(batch, "PATIENCE", 0.1)
+    with pytest.raises(FileNotFoundError, match=f"records of {TOTAL - 1} samples of {TOTAL}"):
+        batch.run(job, workers=1)
+    assert not (job.parent / "out" / "manifest.csv").exists()
+
+
 @pytest.mark.parametrize("other", [True, False], ids=["goes on", "has died"])
 def test_two_commands_that_finish_at_once_without_locks(job, monkeypatch, other):
     """The other one's sweep takes away what this one is writing: this one waits for the other's manifest."""
