@@ -36,7 +36,7 @@ from optics.diagnosis.text import sentence
 from optics.diagnosis.thresholds import CLEAR, EXCESS, LEVEL, MAX_SPLIT, SHARE, close
 from optics.errors import Underdetermined
 from optics.fit import calibrate
-from optics.fit.model import Model, value_of
+from optics.fit.model import Model
 from optics.fit.result import Fit
 from optics.scene.declare import Effect
 from optics.scene.parameter import Variable
@@ -161,7 +161,7 @@ def diagnose(
     families = prints.families(fingerprints)
     beside = case.session if evidence.is_table else None if best.by_frame else case.lamp
     laws = other_laws(model, evidence, places, added, variables_of, outcome.scale, beside)
-    splits, chance = _split(case, outcome, subject, basis, fits)
+    splits, chance = _split(case, outcome, subject, basis)
     shifts = held.shifts(case, best.members, best.fit) if subject else []
 
     findings = findings_of(case, outcome, fingerprints, laws, splits, chance, levels, basis)
@@ -236,13 +236,10 @@ def _choose(case: Case, top: int, asked: Collection[str] = ()) -> list[Candidate
     return chosen + [c for c in live if c.effect.name in others]
 
 
-def _split(
-    case: Case, outcome: Outcome, subject: Candidate | None, basis: Basis, fits: dict[str, Fit]
-) -> tuple[list[Split], float]:
+def _split(case: Case, outcome: Outcome, subject: Candidate | None, basis: Basis) -> tuple[list[Split], float]:
     """(splits of the main effect of each survivor, p of the subject's strength by its scatter).
 
-    What scatters is written into the refit of an effect that explains the residual by itself; where its strength comes
-    to rest, into `fits` as well."""
+    What scatters is written into the refit of an effect that explains the residual by itself."""
     splits: list[Split] = []
     chance = math.nan
     done: set[str] = set()
@@ -262,7 +259,7 @@ def _split(
         if not case.evidence.is_table and trial.fall < SHARE * _excess(basis):
             continue  # too little for a claim, and a split takes as long as a score
         beside = [v for c in trial.members if c is not main for v in c.variables]
-        own, p, clutter, noise, settled = homogeneity.split(
+        own, p, clutter, noise = homogeneity.split(
             case.model,
             case.evidence,
             case.places or [],
@@ -279,22 +276,14 @@ def _split(
         )
         splits += own
         if not case.evidence.is_table:  # refits of readings are linearised where they end
-            if after_at(case, settled.values) < trial.after:
-                trial.fit = settled
             trial.fit = homogeneity.with_errors(trial.fit, main.variables, noise)
         # of readings, noise that neighbours share and errors of dials have been rivals, by their likelihood
         p = math.nan if case.evidence.is_table else case.table.family.bounded(p)
         chance = p if main is subject else chance
         if len(trial.members) == 1 and main.row.refit is not None:
             sd = dict(zip((v.name for v in trial.fit.variables), trial.fit.sd))
-            main.row.refit = replace(
-                main.row.refit,
-                strength=[value_of(case.model, trial.fit.values, v) for v in main.variables],
-                sd=[float(sd[v.name]) for v in main.variables],
-            )
+            main.row.refit = replace(main.row.refit, sd=[float(sd[v.name]) for v in main.variables])
             main.row.refit = homogeneity.scattered(main.row.refitted, p, clutter)
-            if not case.evidence.is_table:
-                fits[main.effect.name] = trial.fit
     return splits, chance
 
 

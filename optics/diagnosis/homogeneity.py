@@ -18,7 +18,6 @@ from optics.diagnosis.evidence import Block, Candidate, Evidence, Progress, at_b
 from optics.diagnosis.result import Explanation, Refit, Split
 from optics.diagnosis.session import Frames, Session
 from optics.diagnosis.thresholds import LEVEL, MAPS, UNEVEN
-from optics.fit.calibrate import NEAR
 from optics.fit.compare import led_label
 from optics.fit.model import Model, value_of
 from optics.fit.result import Fit
@@ -73,9 +72,8 @@ def split(
     beside: Sequence[Variable] = (),
     noise: Correlation | None = None,
     over_noise: float = 0.0,
-) -> tuple[list[Split], float, np.ndarray, np.ndarray, Fit]:
-    """Whether a fitted effect has the same strength in every part of the data, `scatter` of its strength, and the fit
-    `settled`.
+) -> tuple[list[Split], float, np.ndarray, np.ndarray]:
+    """Whether a fitted effect has the same strength in every part of the data, and `scatter` of its strength.
 
     With the effect in the base, the image e by which it differs from the model without it is cut into parts e 1{part},
     and these are scored: a true effect gains nothing by being cut, a proxy does.
@@ -117,29 +115,7 @@ def split(
     chance, clutter, errors = scatter(told.own, told.calibrated, told.effect, told.change, places, net)
     if added is not told:  # errors are those of a fit without a lamp; whether it is there is asked beside that lamp
         chance, *_ = scatter(added.own, added.calibrated, added.effect, _at_optimum(added), places, over_noise)
-    return results, chance, clutter, errors, settled(model, found, told)
-
-
-def settled(model: Model, found: Fit, added: Added) -> Fit:
-    """A refit one step further, to the optimum by the derivative images of where it ended.
-
-    A refit of images ends where falls are known well enough to compare them, with up to half of chi2 per variable left.
-    It has come from too small a strength, so that its strength is still some of its errors too small."""
-    own, columns = added.own, [*added.calibrated, *added.effect]
-    precision, pull = (np.concatenate([k, np.zeros(len(added.effect))]) for k in (own.precision, own.pull))
-    gram = own.normal.gram[np.ix_(columns, columns)] + np.diag(precision)
-    score = own.normal.score[columns] + pull
-    step = st.inverse(gram, own.normal.truncation(columns))[0] @ score
-    if not 0 < step @ score < NEAR * len(columns):  # too far for a step by itself
-        return found
-    values, estimate = found.values.copy(), np.array(found.estimate, float)
-    place = {v.name: i for i, v in enumerate(found.variables)}
-    for column, change in zip(columns, step):
-        v = own.columns[column]
-        values.put(v, float(np.clip(value_of(model, found.values, v) + change, *v.parameter.bounds)))
-        if v.name in place:
-            estimate[place[v.name]] = value_of(model, values, v)
-    return replace(found, values=values, estimate=estimate)
+    return results, chance, clutter, errors
 
 
 def _at_optimum(added: Added) -> np.ndarray:

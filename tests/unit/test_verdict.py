@@ -642,28 +642,6 @@ def test_what_splits_a_strength_is_held_against_clutter_too(proxy):
     assert np.mean(naive) > 0.9 and (np.mean(uneven) > 0.9 if proxy else np.mean(uneven) < 0.15), np.mean(uneven)
 
 
-def test_a_refit_that_stopped_short_is_settled():
-    """Two sd short of its optimum, where a refit of images may end: the strength is that of the optimum. A hundred sd
-    short, no single step is trusted."""
-    power, slope = (Variable(key, (key,), p) for key, p in Slope.parameters.items())
-    model = Slope(np.zeros(Slope.shape))
-    model.frames[0].image = Slope.noise.expose(64 + 400 * (1 + 0.06 * model.across), np.random.default_rng(6))
-    fit = mock_fit(model, [power, slope], Values(), [0])
-    c = Candidate.at(model, Values(), Effect("slope", "lamp", ("slope",)), [slope])
-    base = measure(model, fit.values, [power], [c], [0], 10**6, 0, lambda *a: None)
-    places = [{"place": np.arange(1024.0) // 64, "channel": np.zeros(1024)}]
-    left, found = SimpleNamespace(complete=True, excess_sd=0.0, structure_p=0.5), []
-    for far in (0.0, 2.0, 100.0):
-        off = fit.estimate - far * np.array([-0.3, 1.0]) * fit.sd
-        values = Values({"lamp.power": off[0], "lamp.slope": off[1]})
-        short = replace(fit, values=values, estimate=off)
-        settled = homogeneity.split(model, base, places, 10**6, 0, lambda *a: None, c, short, left, 100.0)[-1]
-        assert settled.values.common["lamp.slope"] == settled.estimate[1]
-        found.append((settled.estimate - fit.estimate) / fit.sd)
-    np.testing.assert_allclose(found[:2], 0.0, atol=0.05)  # weights follow the prediction
-    np.testing.assert_allclose(found[2], [30.0, -100.0], rtol=1e-6)
-
-
 class Slopes(Slope):
     """The same in several frames, the slope from one side on: with a strength in each frame it takes up part of what a
     lamp does there. `lift` is added to the slope in every second frame, and taken off in the others."""
