@@ -35,6 +35,7 @@ sample) and manifest.csv; until then a sample is recorded, once its files stand,
 from __future__ import annotations
 
 import csv
+import errno
 import functools
 import itertools
 import json
@@ -484,10 +485,12 @@ PATIENCE = 10.0  # s for another command to write its manifest, also where a fil
 
 
 def finish(job: Job, blocks: Blocks) -> bool:
-    """Write one ordered manifest and its table once every sample of the job is recorded; whether it is."""
-    if not blocks.finished:
+    """Write one ordered manifest and its table once every sample of the job is recorded; whether they stand. Where
+    another worker is at it, wait for it a little."""
+    until = time.monotonic() + PATIENCE
+    while not blocks.finished:
         if len(blocks.complete()) < blocks.count:
-            return False
+            return blocks.finished  # while the blocks were counted, another one may have ended
         try:
             with alone(blocks.parts / "finish.lock", ""):
                 for pattern in (".manifest.*", ".job.*", ".parameters.*"):  # of commands that were killed
@@ -495,15 +498,15 @@ def finish(job: Job, blocks: Blocks) -> bool:
                         file.unlink(missing_ok=True)
                 if not blocks.finished:
                     _write_table(job, blocks)
-                blocks.finish()
-        except OutputExists:
-            pass  # another worker is at it
+                    blocks.finish()
+        except OutputExists:  # another worker is at it; the records that it reads are not to be taken away
+            if time.monotonic() > until:
+                return False
         except FileNotFoundError:  # `.parts` is gone, or, where a file system has no locks, what was being written
-            until = time.monotonic() + PATIENCE
-            while not blocks.finished:  # another command has been at it, or is
-                if time.monotonic() > until:
-                    raise
-                time.sleep(PATIENCE / 50)
+            if time.monotonic() > until:
+                raise
+        if not blocks.finished:
+            time.sleep(PATIENCE / 50)
     return blocks.finish()
 
 
@@ -515,7 +518,9 @@ def _write_table(job: Job, blocks: Blocks) -> None:
         keys: list[str] = []
         told: list[str] = []
         roles: list[str] = []
+        count = 0
         for record in blocks.records():
+            count += 1
             unit = {"unit": record["unit"]} if "unit" in record else {}
             values = {**unit, **job.parameters, **record["sample"]}
             labels = labelling.flat(record.get("labels", {}))
@@ -525,6 +530,8 @@ def _write_table(job: Job, blocks: Blocks) -> None:
                 writer.writerow(["index", *keys, *told, *roles])
             row = (*(values[k] for k in keys), *(labels.get(k) for k in told), *(files[r]["file"] for r in roles))
             writer.writerow([record["index"], *row])
+        if count < blocks.total:  # another one took them into its manifest meanwhile
+            raise FileNotFoundError(errno.ENOENT, "records are gone", str(blocks.parts))
 
 
 # -- the work --------------------------------------------------------------------------------------------------------

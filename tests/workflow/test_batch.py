@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import hashlib
+import itertools
 import json
 import multiprocessing
 import os
@@ -512,6 +513,36 @@ def test_two_commands_that_finish_at_once_without_locks(job, monkeypatch, other)
     else:
         with pytest.raises(FileNotFoundError):
             batch.run(job, workers=1)
+
+
+def test_who_finishes_leaves_the_records_to_another_that_is_at_it(whole, job, monkeypatch):
+    """Both have found all complete. The second one wrote the manifest and took the records from under the first one's
+    table, which then lacked rows."""
+    out, write, ends = job.parent / "out", batch._write_table, []
+
+    def slow(own, blocks):
+        ends.append(threading.Thread(target=lambda: ends.append(batch.finish(own, Blocks(out, TOTAL)))))
+        ends[0].start()
+        time.sleep(0.5)
+        assert not (out / "manifest.jsonl").exists() and (out / ".parts").is_dir()
+        write(own, blocks)
+
+    monkeypatch.setattr(batch, "_write_table", slow)
+    assert batch.run(job, workers=1).complete
+    ends[0].join()
+    assert ends[1:] == [True] and content(out) == content(whole)
+
+
+def test_a_table_that_lacks_rows_is_not_kept(job, monkeypatch):
+    """Where a file system has no locks, records may go while the table is written."""
+    records = Blocks.records
+    monkeypatch.setattr(Blocks, "records", lambda self: itertools.islice(records(self), TOTAL - 1))
+    monkeypatch.setattr(batch, "PATIENCE", 0.1)
+    with pytest.raises(FileNotFoundError, match="records are gone"):
+        batch.run(job, workers=1)
+    assert not list((job.parent / "out").glob("manifest*"))
+    monkeypatch.undo()
+    assert batch.run(job, workers=1).complete
 
 
 @in_proc
