@@ -489,7 +489,7 @@ def finish(job: Job, blocks: Blocks) -> bool:
     One worker does it, and the others wait for it: whoever ends first removes the records that the table is made of."""
     while not blocks.finished:
         if len(blocks.complete()) < blocks.count:
-            return False
+            return blocks.finished  # while the blocks were counted, another one may have ended
         try:
             with alone(blocks.parts / "finish.lock", ""):
                 for pattern in (".manifest.*", ".job.*", ".parameters.*"):  # of commands that were killed
