@@ -99,6 +99,7 @@ def test_robust_weights_shrug_off_glints(solved):
     assert np.abs(robust.estimate - clean.estimate).max() < 0.25 * np.abs(plain.estimate - clean.estimate).min()
 
 
+@pytest.mark.slow
 def test_a_saturated_set_and_an_unknown_pattern_are_refused(solved):
     model, _, _ = solved
     with pytest.raises(UnknownKey, match="led_1.x"):
