@@ -11,7 +11,7 @@ spectra      a new press in auto bands over the same in the scene's fixed ones, 
              a wall under a white LED by auto bands and by stock `path` with wavelengths by Monte Carlo: time at equal
              noise
 ranking      every effect scored on 16 frames of 160 x 120, presses solved for as well
-processors   the new press and the ranking by LLVM and, where there is an NVIDIA device, by CUDA
+cuda         the new press and the ranking on an NVIDIA device, where there is one; on the processor: press, ranking
 """
 
 from __future__ import annotations
@@ -367,15 +367,16 @@ def press_of_ours():
     return renderer, values, press, ours
 
 
-def processors() -> None:
+def cuda() -> None:
+    """In a process of its own, as the variant of all parts is chosen when it starts."""
     from optics.scene.mitsuba_parts import VARIABLE
 
-    for variant in ("llvm_ad_spectral_polarized", "cuda_ad_spectral_polarized"):
-        print(variant, flush=True)
-        command = [sys.executable, "-m", "optics.proof.speed", "press", "ranking"]
-        done = subprocess.run(command, env={**os.environ, VARIABLE: variant}, stderr=subprocess.PIPE, text=True)
-        if done.returncode:
-            row("not measured", "", (done.stderr.strip().splitlines() or ["no reason given"])[-1])
+    variant = "cuda_ad_spectral_polarized"
+    print(variant, flush=True)
+    command = [sys.executable, "-m", "optics.proof.speed", "press", "ranking"]
+    done = subprocess.run(command, env={**os.environ, VARIABLE: variant}, stderr=subprocess.PIPE, text=True)
+    if done.returncode:
+        row("not measured", "", (done.stderr.strip().splitlines() or ["no reason given"])[-1])
 
 
 def presses() -> None:
@@ -393,21 +394,15 @@ def presses() -> None:
     against_stock(renderer, now, ours)
 
 
-PARTS = {
-    "presses": presses,
-    "grid": printed_grid,
-    "spectra": spectra,
-    "ranking": ranking,
-    "processors": processors,
-}
-OF_A_PROCESSOR = {"press": press_of_ours, "ranking": ranking}  # what `processors` runs by each variant
+PARTS = {"presses": presses, "grid": printed_grid, "spectra": spectra, "ranking": ranking, "cuda": cuda}
+ALONE = {"press": press_of_ours}  # the first lines of `presses` by themselves
 
 
 def main(names: Sequence[str]) -> int:
     """Measure the named parts; none named: all."""
-    parts = {**OF_A_PROCESSOR, **PARTS}
+    parts = {**PARTS, **ALONE}
     if unknown := set(names) - set(parts):
-        print(f"no part {', '.join(sorted(unknown))}; there are {', '.join(PARTS)}", file=sys.stderr)
+        print(f"no part {', '.join(sorted(unknown))}; there are {', '.join(parts)}", file=sys.stderr)
         return 2
     from optics.scene.mitsuba_parts import use_variant
 

@@ -145,14 +145,14 @@ def test_parts_in_which_a_kind_acts_and_parts_that_are_found():
     assert measures.flagged(SimpleNamespace(fingerprints=[])) is None
 
 
-def blurred_by_maker(row, variance, law):
-    """(W,) of what the maker of touch sensors makes of a row, given as f(edges of parts of pixels)."""
+def lens_of_maker(row, effects, law):
+    """(W,) of what the lens of the maker of touch sensors makes of a row, given as f(edges of parts of pixels)."""
     from optics.proof.makers import touch as maker
     from optics.proof.rigs.touch import Wild
 
     class Line(Wild):
         def __init__(self):
-            self.effects, self.other = {"lens blur": variance}, law == "other"
+            self.effects, self.other = effects, law == "other"
             self.values, self.camera, self.size, self.spp = {"camera.x_fov": 50.0}, "camera", (41, 31), 256
 
         def light(self, press):
@@ -171,7 +171,7 @@ def test_makers_blur_has_the_variance_that_is_hidden(variance, law):
     from scipy.special import ndtr
 
     x = np.arange(41) + 0.5
-    found = blurred_by_maker(lambda edges: np.diff(ndtr((edges - 20.5) / 2)), variance, law)
+    found = lens_of_maker(lambda edges: np.diff(ndtr((edges - 20.5) / 2)), {"lens blur": variance}, law)
     spot = np.diff(ndtr((np.arange(42) - 20.5) / 2))
     assert found.sum() == pytest.approx(spot.sum(), rel=1e-6)
     # a disc of parts of pixels is an eighth of a pixel wider, in variance 1/12 of its square
@@ -186,9 +186,21 @@ def test_makers_blur_acts_within_pixels():
     from scipy.special import ndtr
 
     for at in (20.0625, 20.4375, 20.9375):
-        found = blurred_by_maker(lambda edges: 1.0 * np.histogram([at], edges)[0], 0.1, "same")
+        found = lens_of_maker(lambda edges: 1.0 * np.histogram([at], edges)[0], {"lens blur": 0.1}, "same")
         expected = np.diff(ndtr((np.arange(42) - at) / np.sqrt(0.1)))
         assert found == pytest.approx(expected, abs=3e-3)
+
+
+@pytest.mark.parametrize("law", ["same", "other"])
+def test_makers_distortion_moves_edges_and_softens_none(law):
+    """An edge at 33.3 px, seen where the law moves it: the pixel there has the share that is lit, its neighbours all or
+    nothing. A spline through parts of pixels leaves 2e-4; one through pixel means left 0.04 and 0.06."""
+    focal, k1, at = 20.5 / np.tan(np.radians(25)), 0.2, 33.3
+    r2, far = ((at - 20.5) / focal) ** 2, (20**2 + 15**2) / focal**2
+    moved = 20.5 + (at - 20.5) * (1 + k1 * (r2 if law == "same" else (r2 + r2**2 / far) / 2))
+    lit = lambda edges: np.clip((at - edges[:-1]) / np.diff(edges), 0, 1) / 8  # noqa: E731
+    found = lens_of_maker(lit, {"radial distortion": k1}, law)
+    assert found == pytest.approx(np.clip(moved - np.arange(41), 0, 1), abs=1e-3)
 
 
 def test_makers_blur_of_beads_moves_each_ray_by_itself():

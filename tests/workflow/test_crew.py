@@ -74,6 +74,14 @@ def test_the_environment_says_how_many(monkeypatch):
         crews.use_processes(0)
 
 
+def test_a_graphics_processor_has_one_process(mitsuba, monkeypatch):
+    monkeypatch.setattr(crews, "_allowed", 3)
+    monkeypatch.setattr(crews, "free_memory", lambda: 9 * crews.MEMORY)
+    assert crews.allowed() == 3
+    monkeypatch.setattr(mitsuba, "variant", lambda: "cuda_ad_spectral_polarized")
+    assert crews.allowed() == 1
+
+
 @pytest.fixture(scope="module")
 def setup(tmp_path_factory, mitsuba):
     """Three presses of one to three frames, each frame under two of the six LEDs."""

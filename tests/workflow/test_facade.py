@@ -54,6 +54,13 @@ def test_importing_is_quick_and_sets_no_variant():
     assert variant.strip() == "None"
 
 
+def test_the_environment_names_the_variant(monkeypatch):
+    monkeypatch.setenv("OPTICS_VARIANT", "llvm_ad_mono_polarized")
+    code = 'import optics; optics.load("polarizer_bench", {"width": 1, "height": 1}); import mitsuba; '
+    code += "print(mitsuba.variant())"
+    assert in_a_new_process(code).strip() == "llvm_ad_mono_polarized"
+
+
 def test_every_public_name_resolves_and_is_listed():
     names = set(optics.__all__) - {"register"}
     assert names <= set(dir(optics)) and all(getattr(optics, name) is not None for name in names)

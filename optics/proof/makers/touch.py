@@ -311,18 +311,18 @@ class Maker:
         focal = FINE * self.size[0] / 2 / np.tan(np.radians(self.values[f"{self.camera}.x_fov"]) / 2)
         height, width = plane.shape
         y, x = np.mgrid[:height, :width] + 0.5
-        x, y = self.undistorted((x - width / 2) / focal, (y - height / 2) / focal)
+        x, y = (x - width / 2) / focal, (y - height / 2) / focal
+        xs, ys = x, y  # where a distorted point came from
+        for _ in range(20):
+            stretch = self.stretch(xs**2 + ys**2)
+            xs, ys = x / stretch, y / stretch
         return map_coordinates(
-            plane, [y * focal + height / 2 - 0.5, x * focal + width / 2 - 0.5], order=3, mode="nearest"
+            plane, [ys * focal + height / 2 - 0.5, xs * focal + width / 2 - 0.5], order=3, mode="nearest"
         )
 
-    def undistorted(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Tangents that a distorted point came from: x_d = x (1 + k1 r^2)."""
-        xs, ys = x, y
-        for _ in range(20):
-            stretch = 1 + self.effects["radial distortion"] * (xs**2 + ys**2)
-            xs, ys = x / stretch, y / stretch
-        return xs, ys
+    def stretch(self, r2: np.ndarray) -> np.ndarray:
+        """x_d/x of a lens that distorts, by the square of the tangent: 1 + k1 r^2."""
+        return 1 + self.effects["radial distortion"] * r2
 
     def spread(self, plane: np.ndarray) -> np.ndarray:
         """A plane of parts of pixels behind the lens."""

@@ -256,16 +256,11 @@ class Wild(Workshop, synthetic.Maker):
             image = image + e["veiling glare"] * (wide - image)
         return image
 
-    def undistorted(self, x, y):
+    def stretch(self, r2):
         if not self.other:
-            return super().undistorted(x, y)
-        own_x, own_y = self._tangents()
-        farthest, (xs, ys) = (own_x**2 + own_y**2).max(), (x, y)
-        for _ in range(20):
-            r2 = xs**2 + ys**2
-            stretch = 1 + self.effects["radial distortion"] * (r2 + r2**2 / farthest) / 2
-            xs, ys = x / stretch, y / stretch
-        return xs, ys
+            return super().stretch(r2)
+        x, y = self._tangents()
+        return super().stretch((r2 + r2**2 / (x**2 + y**2).max()) / 2)
 
     def spread(self, plane):
         from scipy.signal import fftconvolve
