@@ -495,6 +495,7 @@ def test_the_longest_step_is_safe_and_no_smaller_than_needed():
     assert 0.6 * 2 / fastest < skin.longest_step <= 2 / fastest
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "push, forces, gravity",
     [

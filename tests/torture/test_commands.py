@@ -104,6 +104,7 @@ LARGE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", LARGE)
 def test_sizes_and_counts_beyond_any_use(place, met, monkeypatch, words):
     monkeypatch.chdir(place)

@@ -63,6 +63,7 @@ def write(file, text):
     file.write_bytes(text.encode("utf-8", errors="surrogatepass"))
 
 
+@pytest.mark.slow
 @given(data=st.data())
 @pytest.mark.parametrize("kind", ["images", "readings"])
 def test_captures_toml(material, met, tmp_path_factory, kind, data):
@@ -143,6 +144,7 @@ def test_a_study(material, met, tmp_path_factory, name, data):
     met("values", study)
 
 
+@pytest.mark.slow
 @given(data=st.data())
 @pytest.mark.parametrize("name", ["manifest.jsonl", "job.json", "parameters.json", ".parts"])
 def test_a_batch(material, met, tmp_path_factory, name, data):

@@ -83,6 +83,7 @@ def imported(source, tmp_path_factory):
     return scans.import_scans(source, tmp_path_factory.mktemp("out") / "captures", bin=4)
 
 
+@pytest.mark.slow
 def test_plates_noise_and_lights_are_derived(imported):
     facts = json.loads((imported.folder / "import.json").read_text())
     for name, (x, y, turn) in {"one": (0.13, -0.21, 2.0), "two": (-0.3, 0.1, -1.0)}.items():

@@ -614,6 +614,7 @@ def test_a_fit_that_stopped_short_is_no_clutter():
     assert parts == 16
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("proxy", [False, True])
 def test_what_splits_a_strength_is_held_against_clutter_too(proxy):
     """Patches of 8 x 8 px with 1 % of their own, and a slope of 6 %, which a proxy has in the upper half alone. Between
@@ -749,6 +750,7 @@ def test_the_report_can_be_read():
 
 
 # -- invariance, determinism, refusal --------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_units_change_nothing_and_one_seed_gives_one_table():
     """R7 and R20: T, p, survival and cos to 1e-6 under other units of effects and base parameters; same seed, same
     bytes."""

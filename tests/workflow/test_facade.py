@@ -79,6 +79,7 @@ def test_a_scene_by_name():
 
 
 # -- a study ---------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_the_error_falls_to_the_noise_on_frames_that_were_held_out(made):
     study, verdict, before, after, _ = made
     first, last = study.records()

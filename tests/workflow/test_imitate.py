@@ -40,6 +40,7 @@ def study(tmp_path_factory, mitsuba):
     return folder / "study"
 
 
+@pytest.mark.slow
 def test_imitated_captures_are_the_models_own_with_the_cameras_noise(study, tmp_path):
     runner = CliRunner()
     said = runner.invoke(app, ["imitate", str(study), "-o", str(tmp_path / "plain")])

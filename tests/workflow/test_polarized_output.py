@@ -64,6 +64,7 @@ def test_a_scene_with_layers_gives_stokes_vectors(optics, tmp_path):
             assert np.ptp(np.asarray(shown.convert("L"))) > 100
 
 
+@pytest.mark.slow
 def test_the_exact_image_and_monte_carlo_agree(optics, tmp_path):
     options = ["vi2tap", *SMALL, "-D", "analyzer=35", "-D", "depth=1", "-D", "bands=650, 580, 520, 460"]
     for name, more in (("exact", []), ("random", ["--spp", "16", "--seed", "2"])):

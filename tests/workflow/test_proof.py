@@ -144,6 +144,7 @@ def test_the_bench_finds_what_is_hidden_and_predicts_what_comes(bench):
     assert all(abs(p) < 5 for p in found.only.pulls["no clutter"])
 
 
+@pytest.mark.slow
 def test_where_nothing_stands_out_the_set_is_that_of_the_scores(bench):
     """A drift of 0.2 % by which noise hides it: the set is what explains more than chance would, the drift among it,
     and not the library."""

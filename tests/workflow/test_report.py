@@ -395,6 +395,7 @@ def images_in(html: str) -> list:
     return [Image.open(io.BytesIO(base64.b64decode(text))).convert("RGB") for text in found]
 
 
+@pytest.mark.slow
 def test_page_is_one_file_without_outside_resources(studied):
     _, html = studied
     assert len(html) < 6e6

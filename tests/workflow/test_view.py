@@ -432,6 +432,7 @@ def test_what_is_no_study_is_refused_in_a_line(optics, study, tmp_path):
             assert code == 2 and out == "" and words in err and len(err.splitlines()) == 1, err
 
 
+@pytest.mark.slow
 def test_the_command_serves_until_it_is_interrupted(study):
     code = (
         "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # which background jobs ignore
@@ -923,6 +924,7 @@ def test_point_readings_are_drawn_as_points(chromium, mitsuba, tmp_path):
             chromium.drawn()
 
 
+@pytest.mark.slow
 def test_each_analyser_of_a_mosaic_is_an_image_of_its_own(chromium, mitsuba, tmp_path):
     """The page shows the pixels of each analyser together, and counts, predicts and reads out as before."""
     loaded = scene.load("polarization_camera", {"width": "50", "height": "36"})

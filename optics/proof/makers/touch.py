@@ -1,11 +1,11 @@
 """Captures of a pressed gel by a renderer of its own: stock Mitsuba, a denser mesh, its own seeds.
 
 It shares nothing with `optics.light.renderer` or the `tactile` integrator. Mitsuba's `path` traces the light in the
-mono variant, one channel and one LED at a time, with its `perspective` camera, on a uniform mesh three times denser
-than the model's. Effects are made by stock means (more bounces, a `constant` emitter, an LED's disc sampled at random)
-or by scipy on the image, not by the functions that a fit uses. Then come photons, read noise and quantisation. Shared
-with the model are only the formulas of the LED and the membrane, which tests hold to closed forms, the shape of a dent,
-and measured sensitivities of a camera.
+mono variant, one channel and one LED at a time, with its `perspective` camera, on a finer mesh than the model's.
+Effects are made by stock means (more bounces, a `constant` emitter, an LED's disc sampled at random) or by scipy on the
+image, not by the functions that a fit uses. Then come photons, read noise and quantisation. Shared with the model are
+only the formulas of the LED and the membrane, which tests hold to closed forms, the shape of a dent, and measured
+sensitivities of a camera.
 
 How far the model's images are from these, as a share of the noise: with 16 frames of 12 bits, 64 samples per pixel add
 0.01 to 0.02 to chi2 per value, nearly all of it at rims; 256 samples halve that. A disc for an LED adds 0.05."""
@@ -99,7 +99,7 @@ class Maker:
 
     # -- the face -----------------------------------------------------------------------------------------------------
     def mesh(self, press: Sequence[float], pitch: float = 0.02):
-        """The coated face on a grid three times as fine as the model's around the dent, with its exact normals."""
+        """The coated face on a grid that is finer than the model's around the dent, with its exact normals."""
         import mitsuba as mi
 
         from optics.skin import contact
