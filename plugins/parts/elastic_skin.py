@@ -21,11 +21,11 @@ Validity
 References
     Sensors 19 (2019) 928, sections 2 and 3.1; Johnson, Contact Mechanics (1985), ch. 3.
 XML
-    pitch float, 0.06: mm, of the fine part of the mesh
+    pitch float, 0.03: mm, of the fine part of the mesh
     map_pitch float, 0.03: mm, of the maps that hold the contact's shape
     extent float, 3.0: mm, half width of the fine part of the mesh and of those maps
-    columns integer, 181: vertices of the mesh along x
-    rows integer, 161: vertices of the mesh along y
+    columns integer, 0: vertices of the mesh along x; 0: 80 more than the fine part has
+    rows integer, 0: vertices of the mesh along y, likewise
 """
 
 import math

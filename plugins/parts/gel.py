@@ -43,8 +43,8 @@ XML
     pitch float, 0.03: mm, of the fine part of the mesh
     map_pitch float, 0.03: mm, of the maps that hold the dent's shape
     extent float, 3.0: mm, half width of the fine part of the mesh and of those maps
-    columns integer: vertices of the mesh along x; without it BESIDE more than the fine part has
-    rows integer: vertices of the mesh along y; likewise
+    columns integer, 0: vertices of the mesh along x; 0: BESIDE more than the fine part has
+    rows integer, 0: vertices of the mesh along y, likewise
 """
 
 import math
@@ -64,7 +64,7 @@ INDENTER_SIZE = 1.5  # mm
 # vignetting known to 0.08 % comes out 3.9 errors low at 0.06, 1.1 at 0.03 and 0.6 at 0.02, where a press takes a tenth
 # and a quarter longer
 PITCH = 0.03
-BESIDE = 80  # vertices beside the fine part, where the face is nearly flat
+BESIDE, MOST = 80, 2000  # vertices beside the fine part, where the face is nearly flat; and in all, unless stated
 DRAG = ("friction", "shift_x", "shift_y", "twist")
 SHEARING = ("poisson", *DRAG)
 ROUNDING = ("smoothing", "skirt", "fillet")  # of the geometric dent
@@ -334,10 +334,11 @@ def build():
             self.pitch = float(props.get("pitch", PITCH))  # mm, of the fine part of the mesh
             self.map_pitch = float(props.get("map_pitch", 0.03))  # mm, of the maps that hold the dent's shape
             self.extent = float(props.get("extent", 3.0))  # mm, half width of the fine part
-            enough = math.ceil(2 * self.extent / self.pitch) + BESIDE
-            self.columns, self.rows = int(props.get("columns", enough)), int(props.get("rows", enough))
+            sound = max(self.pitch, 1e-9)  # what is none is refused with its axis
+            enough = min(math.ceil(2 * self.extent / sound) + BESIDE, MOST)
+            self.columns, self.rows = (int(props.get(name, 0)) or enough for name in ("columns", "rows"))
             coarsest = float(props.get(self.indenter_radius, INDENTER_SIZE)) / FINE
-            if (times := min(coarseness(), max(int(coarsest / self.pitch), 1))) > 1:
+            if (times := min(coarseness(), max(int(coarsest / sound), 1))) > 1:
                 self.pitch *= times
                 self.columns, self.rows = -(-self.columns // times), -(-self.rows // times)
             index = np.arange(self.columns * self.rows).reshape(self.rows, self.columns)

@@ -93,6 +93,7 @@ def beside(p):
     return 1e-30 if p.neutral == 0 else p.neutral
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("key", EFFECTS)
 def test_an_effect_at_neutral_is_not_there(key, bench):
     """Its functions, evaluated next to neutral, leave the image as it is, with the same random numbers."""
@@ -184,6 +185,7 @@ def test_derivatives_by_the_index(key, factor, mitsuba, tmp_path):
     )
 
 
+@pytest.mark.slow
 def test_the_effect_of_roughness_is_its_square(mitsuba, tmp_path):
     """Before the edge of a luminous half plane, a plate that hardly refracts turns rays by (n - 1) times the slope of a
     facet, twice: the edge x = 0 is seen as wide as s^2 = (alpha (n - 1))^2/2 (L^2 + (L + d/n)^2), L behind the plate of
@@ -290,6 +292,7 @@ def test_no_light_no_image(bench):
         assert image.shape == (scene.camera.resolution[1], scene.camera.resolution[0], 3) and not image.any()
 
 
+@pytest.mark.slow
 def test_the_model_differentiates_by_the_renderer(bench, tmp_path, monkeypatch):
     """One derivative of each way, through development: absorption by the ways, index by differences, a power by
     linearity. Faint rays are not thinned, which a difference would draw anew."""

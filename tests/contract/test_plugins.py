@@ -939,6 +939,7 @@ def test_derivatives_through_a_bent_response(bench):
         compare(found, reference, bench.image({**camera, key: value}), step, 1e-3, what=key)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["multiplicative", "additive"])
 def test_derivatives_with_a_flat_field(bench, mode):
     """The measured background and the prediction at rest take part in every derivative."""
@@ -1072,7 +1073,8 @@ def test_random_strengths_give_images(key, bench_of):
 
 
 # 5: interreflection, haze, absorption, gloss and the size of LEDs are on; 2: absorption and sizes alone
-@pytest.mark.parametrize("seed", [pytest.param(2, marks=pytest.mark.slow), 5])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [2, 5])
 def test_everything_drawn_at_once_gives_images(seed, bench):
     """All parameters of the sensor within a plausible change, all effects on; and derivatives at that point are
     finite."""
@@ -1492,6 +1494,7 @@ def test_the_contract_notices_in_layers(fault, user_bench, mitsuba):
         check(*arguments)
 
 
+@pytest.mark.slow
 def test_stubs_of_new_effects_meet_the_contract(user_bench):
     from optics.study import draft
 

@@ -36,6 +36,7 @@ def test_derivatives_with_a_second_reflection(key, bench, monkeypatch):
     assert alone > 0.03
 
 
+@pytest.mark.slow
 def test_fewer_directions_leave_little_error(bench):
     """Of derivatives, with a second reflection three times as strong as physics allows: the noise of a quarter of the
     directions, 0.055 of what leaving the second reflection out would bring; twice that is allowed."""

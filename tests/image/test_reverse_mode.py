@@ -177,7 +177,7 @@ def test_reverse_mode_is_forward_mode_and_differences(name, plain):
         assert scene.forward(weights, steps) == pytest.approx(terms.sum(), abs=SUMS * np.abs(terms).sum())
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n == "vi2tap" else n for n in SCENES])
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in LONG else n for n in SCENES])
 def test_other_parameters_refuse_a_derivative(name, plain):
     """What moves a surface that is made outside Dr.Jit, or acts on the finished image, would get a silent 0."""
     import drjit as dr

@@ -155,6 +155,7 @@ def test_light_through_a_polarizer(variant):
     agree(scene, tactile(3), {"type": "volpath", "max_depth": 3, "rr_depth": 100})
 
 
+@pytest.mark.slow
 @BOTH
 @pytest.mark.parametrize("max_depth", [2, 3])
 def test_an_area_light_behind_a_null_surface(variant, max_depth):
@@ -344,6 +345,7 @@ EFFECTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("key", EFFECTS)
 def test_effects_of_light_are_in_both_renders(mitsuba, tmp_path, key):
     """What an effect changes, LED by LED and by mi.render: the same in every pixel."""
@@ -587,6 +589,7 @@ def test_stokes_vectors_turn_with_our_camera(mitsuba):
     assert abs(behind_film(45.0)[1]) == pytest.approx(1, abs=0.01)
 
 
+@pytest.mark.slow
 def test_painted_edges_are_as_smooth_as_those_of_shapes(mitsuba):
     """The chequers of the finger's wall against an image eight times as fine: within what the samples of a rim resolve
     of a step of 0.4."""

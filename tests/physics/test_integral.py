@@ -120,6 +120,7 @@ def test_nodes_of_every_shipped_scene_meet_sums_in_steps_of_1_nm(mitsuba, tmp_pa
             assert found == pytest.approx(fine, abs=2e-5 * weights.sum(1).max()), group.lights
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "paint",
     [

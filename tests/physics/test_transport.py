@@ -154,6 +154,7 @@ def test_the_furnace_neither_gains_nor_loses(tmp_path, mitsuba):
     near(found.radiance[0], found.error[0], 1.0)
 
 
+@pytest.mark.slow
 def test_light_goes_both_ways_alike(tmp_path, mitsuba):
     """Power from panel A on panel B through a grid, and from B on A: per radiance and area the same (reciprocity)."""
     from optics.light.transport import BATCHES, Run
@@ -690,6 +691,7 @@ def test_stock_volpath_sees_the_same(tmp_path, mitsuba, roughness):
     )
 
 
+@pytest.mark.slow
 def test_derivatives_by_absorption(tmp_path, mitsuba, monkeypatch):
     """Against central differences with common random numbers; faint rays are not thinned, which would draw anew."""
     from optics.light import transport

@@ -108,6 +108,7 @@ def test_load_file_gives_what_our_loader_gives(name, pressed, mi):
     assert (np.abs(means[0] - means[1]) < 5 * np.hypot(*errors)).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["vi2tap", "magictac"])
 def test_the_comparison_notices_parts_that_were_not_wired(name, mi, monkeypatch):
     """What Mitsuba made of these two before parts looked for one another."""
@@ -154,6 +155,7 @@ def test_updates_through_traverse_are_those_of_our_scene(name, mi):
                 assert np.array_equal(*(np.array(mi.traverse(s)["vertex_positions"]) for s in (a, b))), a.id()
 
 
+@pytest.mark.slow
 def test_what_is_updated_before_the_first_image_is_in_it(mi):
     plain, ours = both(mi, "vi2tap", {})
     params = mi.traverse(plain)

@@ -90,6 +90,7 @@ def test_the_exact_image_and_monte_carlo_agree(optics, tmp_path):
     assert np.abs(exact[thing][..., 1:3]).mean() > 0.3 * level
 
 
+@pytest.mark.slow
 def test_an_led_behind_a_layer_is_not_taken_for_dark(optics, tmp_path):
     text = scene.find("vi2tap").read_text(encoding="utf-8")
     inside = text.replace(
