@@ -32,7 +32,7 @@ from optics.diagnosis.laws import other_laws
 from optics.diagnosis.refit import Case, Cooled, Expected, after_at, refit_each
 from optics.diagnosis.result import Basis, Diagnosis, Family, Fingerprint, Row, Split, kinds_of
 from optics.diagnosis.score import score
-from optics.diagnosis.text import sentence
+from optics.diagnosis.text import leaves_misfit, sentence
 from optics.diagnosis.thresholds import CLEAR, EXCESS, LEVEL, MAX_SPLIT, SHARE, close
 from optics.errors import Underdetermined
 from optics.fit import calibrate
@@ -45,6 +45,10 @@ MAX_REFITS = 10  # besides the winners of other weights: each costs a calibratio
 DRIFT_HINT = (
     "give each frame a flat_field of its own, taken just before or after it; `optics import --background near` makes "
     "one from the presses next to each"
+)
+SURFACE_HINT = (
+    "press the same body twice at one place, and once turned: what stays with the place is the coating's, what turns "
+    "with the body is the body's, and the rest comes of the press"
 )
 FIXED_HINT = "divide the pattern out with a flat_field, mask what is dirt, or note the sensor's own as [noise] prnu"
 
@@ -182,6 +186,9 @@ def diagnose(
     if word in ("UNKNOWN", "CANNOT_TELL"):
         text, first = _unexplained(case, word, text, fingerprints, families, findings, basis)
         hints = [*first, *hints]
+    if leaves_misfit(best.excess_sd, basis):
+        surface = patterns.surface_text(patterns.by_surface(model, best.fit.values, evidence, best.images))
+        text, hints = " ".join(filter(None, [text, surface])), [*hints, *[SURFACE_HINT] * bool(surface)]
     return Diagnosis(
         word=word,
         sentence=text,

@@ -3,24 +3,32 @@
 A pattern that is the same in all frames is dirt, a scratch or the sensor's own. One that successive frames share and
 distant ones do not is a sensor that changes during the session: a coating that wrinkles, a gel that creeps, a window
 that mists over. Neither is an effect on light that presses would show, and both may pass for a curve along what
-happened to differ between frames."""
+happened to differ between frames.
+
+What differs from contact to contact, alike under every light, is the coating or the body there: no law of light follows
+it."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from optics.diagnosis import statistics as st
 from optics.diagnosis.evidence import Evidence
-from optics.diagnosis.result import Drift
-from optics.diagnosis.thresholds import LEVEL, SHARE
+from optics.diagnosis.result import Drift, Surface
+from optics.diagnosis.thresholds import EXCESS, LEVEL, SHARE
 from optics.fit.compare import led_label
 from optics.fit.model import Model
 from optics.scene.parameter import Values
 
 REPEATED = 3  # frames that show a pixel, for a pattern to be called fixed
 SEVERAL = 6  # frames, from which their order can be told from chance: 720 orders
+MANY = 12  # contacts, over which a law is told from what is each contact's own
+LIGHTS = 3  # of a press, under which a pixel is seen
+CELLS = 6  # each way, in which a contact is divided
+MUCH = 0.25  # of what is left, from which it is said
 DISTANT = 1 / 3  # of the session: frames that are so far apart share what does not change
 AWAY = 2.0  # radii of the contact beyond which a press is not asked about
 ORDERS = 1999  # in which chance could have put the frames
@@ -126,4 +134,77 @@ def drifting_text(drift: Drift) -> str:
     return (
         f"{min(drift.share, 1.0):.0%} of the excess lies far from the contacts, in a pattern that successive frames "
         "share and distant ones do not: the untouched sensor changes during the session."
+    )
+
+
+def by_surface(model: Model, values: Values, evidence: Evidence, images: Sequence[np.ndarray]) -> Surface:
+    """What an explanation leaves in contacts that one brightness of each pixel of a press, the same under all its
+    lights, would mend, and that follows no law of the sensor.
+
+    With the residuals r of a pixel in all frames of a press and its whitened signal g there, b = g'r/g'g is what its
+    brightness is off by, and noise alone gives it the variance 1/g'g. A law of light or of the camera goes with the
+    place in the image or with the place in the contact: of b is taken the quadratic in the former and the mean over all
+    contacts at the latter (CELLS each way) that fit best. What is left of it takes b^2 g'g from chi2, of which noise
+    takes 1. The share is of the chi2 of these pixels less the number of their values. NaN where no press is seen under
+    LIGHTS lights, for fewer than MANY contacts, or without excess.
+
+    images   per frame (H, W, C) residual over its noise, 0 where it is not used"""
+    if isinstance(evidence.spectrum, st.Sweeps):
+        return Surface()
+    presses: dict[str, list[int]] = {}
+    for k, i in enumerate(evidence.frames):
+        presses.setdefault(model.frames[i].group or model.frames[i].name, []).append(k)
+    contacts = [c for own in presses.values() for c in _contacts_of(model, values, evidence, images, own)]
+    if len(contacts) < MANY:
+        return Surface()
+    bright, weight, square, count, *places, cell = np.concatenate(contacts, 1)
+    excess = float(square.sum() - count.sum())
+    if excess < EXCESS * math.sqrt(2 * count.sum()):
+        return Surface()
+    laws = np.column_stack([*places, *(cell == c for c in np.unique(cell))]) * np.sqrt(weight)[:, None]
+    law, _, rank, _ = np.linalg.lstsq(laws, bright * np.sqrt(weight), rcond=None)
+    off = bright * np.sqrt(weight) - laws @ law  # in standard deviations
+    taken = float(off @ off) - (len(off) - rank)
+    spread = float(np.mean(off**2 / weight) - np.mean(1 / weight))
+    return Surface(taken / excess, math.sqrt(max(spread, 0.0)), len(contacts))
+
+
+def _contacts_of(
+    model: Model, values: Values, evidence: Evidence, images: Sequence[np.ndarray], own: Sequence[int]
+) -> Iterator[np.ndarray]:
+    """(10, n) of the pixels of each contact of a press: b, g'g, r'r, number of values; the terms of a quadratic in the
+    place in the image; the number of the cell of the contact. own: which of the evidence's frames the press has."""
+    from scipy.ndimage import label
+
+    frames = [evidence.frames[k] for k in own]
+    where = model.coordinates(values, frames[0])
+    if len({led_label(model.frames[i].parameters) for i in frames}) < LIGHTS or "contact" not in where:
+        return
+    numbers, several = label(np.asarray(where["contact"], bool))
+    along, length, square, count = np.zeros((4, *numbers.shape))
+    for k, i in zip(own, frames):
+        use = np.asarray(evidence.use[k], bool)
+        light = np.asarray(model.predict(values, [i])[0], float) - float(model.noise.black_level)
+        g, r = np.where(use, light / evidence.sigma[k], 0.0), np.where(use, images[k], 0.0).astype(float)
+        for total, product in ((along, g * r), (length, g * g), (square, r * r), (count, use)):
+            total += product.sum(-1)
+    for n in range(1, several + 1):
+        whole = np.array(np.nonzero(numbers == n), float)
+        y, x = seen = np.nonzero((numbers == n) & (count >= LIGHTS) & (length > 0))
+        middle, radius = whole.mean(1, keepdims=True), math.sqrt(whole.shape[1] / math.pi)
+        down, right = np.clip((np.array(seen) - middle) / radius * CELLS / 2 + CELLS / 2, 0, CELLS - 1) // 1
+        u, v = x / numbers.shape[1] - 0.5, y / numbers.shape[0] - 0.5
+        if len(x):
+            b, weight = along[seen] / length[seen], length[seen]
+            yield np.stack([b, weight, square[seen], count[seen], u, v, u * u, u * v, v * v, CELLS * down + right])
+
+
+def surface_text(found: Surface) -> str:
+    """One sentence where the surface holds more than MUCH of what is left in contacts; '' where not."""
+    if not found.share > MUCH:
+        return ""
+    return (
+        f"{min(found.share, 1.0):.0%} of what is left in the {found.contacts} contacts is one brightness of each "
+        f"pixel, the same under every light ({found.rms:.1%} rms), and goes with no place in the image or in the "
+        "contact: it belongs to the coating or to the body that presses, and no law of light follows it."
     )

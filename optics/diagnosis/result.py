@@ -363,6 +363,16 @@ class Drift:
 
 
 @dataclass(frozen=True)
+class Surface:
+    """What differs from contact to contact, the same under every light (`optics.diagnosis.patterns.by_surface`): its
+    share of the excess misfit in the contacts, its rms as a share of the brightness, and their number."""
+
+    share: float = math.nan
+    rms: float = math.nan
+    contacts: int = 0
+
+
+@dataclass(frozen=True)
 class Shift:
     """How far a calibrated parameter had moved to hide an effect: its value with the effect less that without."""
 
