@@ -16,6 +16,7 @@ AUTO = {"bands": "auto", "sensitivity": "Nikon 5100 (NPL)"}
 SCENES = sorted(p.stem for p in shipped("scenes").glob("*.xml"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name, defines", [*((name, {}) for name in SCENES), ("gelsight", AUTO), ("vi2tap", AUTO)])
 def test_parts_go_with_their_scene(mitsuba, name, defines):
     small = {} if name == "polarizer_bench" else {"width": "8", "height": "8"}

@@ -733,6 +733,7 @@ def random_stack(rng):
     return plates, {**values, **drawn(rng, SOURCE, "source")}
 
 
+@pytest.mark.slow
 @BOTH
 @pytest.mark.parametrize("seed", [5, 6])
 def test_a_tilted_stack_before_a_wide_camera(variant, tmp_path, seed):

@@ -252,6 +252,7 @@ def test_facets_have_beckmanns_slopes(tmp_path, mitsuba):
         assert abs((slope**4).mean() / (0.75 * roughness**4) - 1) < SIGMAS * np.sqrt(96 / 9 / count)
 
 
+@pytest.mark.slow
 def test_faces_hardly_rough_are_nearly_smooth(tmp_path, mitsuba):
     """The same random numbers at every roughness: the image of a grid does not move up to 1e-4, and at 1e-3 by less
     than its noise."""

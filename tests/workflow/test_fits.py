@@ -111,6 +111,7 @@ def test_ladder_compare_view_and_report_give_one_held_out_number(studied, optics
     assert f"{level['chi2_per_dof']:#.4g}" in table
 
 
+@pytest.mark.slow
 def test_new_captures_count_nothing_as_fitted(touched, read, optics, tmp_path):
     """The same scene and fit on other readings: no number was fitted to them, and none is held out."""
     settings = [{"polarizer.angle": 30.0, "analyzer.angle": 11.25 * i, "source.power": 1.0} for i in range(16)]
