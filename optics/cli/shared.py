@@ -14,6 +14,7 @@ import sys
 import time
 import traceback
 import warnings
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -144,15 +145,18 @@ class Terminal:
 
 
 def _lines() -> Callable[[str, int, int], None]:
-    """Progress as lines, one every EVERY seconds: quick work writes none."""
-    last = time.monotonic()
+    """Progress as lines, one every EVERY seconds: quick work writes none. What begins anew gets a number: a study
+    calibrates several times."""
+    last, reached, times = time.monotonic(), dict[str, int](), Counter[str]()
 
     def show(what: str, done: int, total: int) -> None:
         nonlocal last
         terminal.go_on()
+        times[what] += done < reached.get(what, math.inf)
+        reached[what] = done
         if time.monotonic() - last >= EVERY:
             last = time.monotonic()
-            say(f"{what}: {done} of {total}")
+            say(f"{what}{f' ({times[what]})' * (times[what] > 1)}: {done} of {total}")
 
     return show
 

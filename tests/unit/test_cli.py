@@ -479,15 +479,17 @@ def test_values_of_a_fit_hold_for_their_frames(measured, tmp_path):
 
 
 def test_progress_is_lines_where_there_is_no_terminal(capsys, monkeypatch):
-    """One every ten seconds: none of quick work, none with --quiet."""
+    """One every ten seconds: none of quick work, none with --quiet. What begins anew is numbered."""
     from optics.cli import shared
 
-    clock = iter([0.0, 3.0, 11.0, 11.0, 12.0, 30.0, 30.0])
+    clock = iter([0.0, 3.0, 11.0, 11.0, 12.0, 30.0, 30.0, 31.0, 50.0, 50.0])
     monkeypatch.setattr(shared.time, "monotonic", lambda: next(clock))
     with shared.Terminal().progress() as show:
         for done in range(4):
             show("calibrate", done, 10)
-    assert capsys.readouterr().err == "calibrate: 1 of 10\ncalibrate: 3 of 10\n"
+        for done in (0, 1):
+            show("calibrate", done, 10)
+    assert capsys.readouterr().err == "calibrate: 1 of 10\ncalibrate: 3 of 10\ncalibrate (2): 1 of 10\n"
     silent = shared.Terminal()
     silent.quiet = True
     with silent.progress() as show:
