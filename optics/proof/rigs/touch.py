@@ -63,7 +63,7 @@ UNKNOWN = {
     "banding": ("row",),
     "tap": ("column",),
     "ring": ("radius",),
-    "height gain": ("height", "gel_path"),
+    "height bands": ("height", "gel_path"),
     "slope gain": ("slope",),
     "contact film": ("contact", "contact_distance"),
     "red drift": ("frame",),
@@ -289,11 +289,11 @@ class Wild(Workshop, synthetic.Maker):
     def gain(self, kind: str, size: float, frame: int, press) -> np.ndarray:
         from optics.skin import contact
 
-        if kind not in ("height gain", "slope gain", "contact film"):
+        if kind not in ("height bands", "slope gain", "contact film"):
             return super().gain(kind, size, frame, press)
         point = self.seen(press)[0]
-        if kind == "height gain":
-            p = -point[..., 2] / 0.5
+        if kind == "height bands":  # fringes, as of a film whose thickness goes with the height
+            p = np.cos(2 * np.pi * point[..., 2] / 0.4)
         elif kind == "slope gain":
             p = sum(g**2 for g in np.gradient(point[..., 2], 2 * self._half() / self.size[0])) / 0.04
         else:  # a film that the contact leaves
