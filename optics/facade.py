@@ -34,7 +34,7 @@ from optics.scene.parameter import Values
 from optics.scene.trust import Named
 from optics.study import loop
 from optics.study.calibrated import noise_of, plugins_of_fit, scene_of, tested
-from optics.study.checks import the_same, without_shading
+from optics.study.checks import repeated_images, without_shading
 from optics.study.fit_files import fit_file, read_fit, values_of
 from optics.study.record import Record, readable
 from optics.study.setup import Setup, open_model, recorded, setup_for, split
@@ -206,7 +206,7 @@ def compare(
         model, fit, {**({} if fit is not None else setup.values), **model.scene.spread(values or {}, "values")}
     )
     comparison, notes = tested(model, present, fit, _listed(held_out))
-    return Compared(model, present, comparison, [*notes, *without_shading(model), *the_same(model)])
+    return Compared(model, present, comparison, [*notes, *without_shading(model), *repeated_images(model)])
 
 
 def _taken_from(

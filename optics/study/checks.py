@@ -37,7 +37,7 @@ def of_captures(model: SceneModel) -> list[str]:
     from optics.light.rendering import veiled
 
     texts = [*model.captures.warnings, *warnings_of(model.noise, model.captures), *_unnamed(model), *_astray(model)]
-    texts += [*without_shading(model), *the_same(model)]
+    texts += [*without_shading(model), *repeated_images(model)]
     if model.cut_off:
         count = sum(int((f.image == 0).sum()) for f in model.frames)
         texts.append(
@@ -152,7 +152,7 @@ def without_shading(model: SceneModel) -> list[str]:
     ]
 
 
-def the_same(model: SceneModel) -> list[str]:
+def repeated_images(model: SceneModel) -> list[str]:
     """Images of the same pixels under other names: noise gives no camera the same image twice."""
     first: dict[bytes, str] = {}
     pairs = []

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -91,18 +92,23 @@ def markers(
     return rows
 
 
-def _found(image: np.ndarray, count: int | None, name: str) -> marker_reader.Markers:
+@contextmanager
+def _of(name: str) -> Iterator[None]:
+    """Errors in it begin with the file's name."""
     try:
-        return marker_reader.find(image, count)
+        yield
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from error
+
+
+def _found(image: np.ndarray, count: int | None, name: str) -> marker_reader.Markers:
+    with _of(name):
+        return marker_reader.find(image, count)
 
 
 def _ordered(found: marker_reader.Markers, grid: tuple[int, int] | None, name: str) -> marker_reader.Markers:
-    try:
+    with _of(name):
         return found if grid is None else found[marker_reader.grid_order(found, *grid)]
-    except ValueError as error:
-        raise ValueError(f"{name}: {error}") from error
 
 
 def proximity(
@@ -122,10 +128,8 @@ def proximity(
     rows: list[Row] = []
     first = None
     for name, image in _each(files, "proximity", progress):
-        try:
+        with _of(name):
             area = proximity_reader.area(image, behind, threshold)
-        except ValueError as error:
-            raise ValueError(f"{name}: {error}") from error
         first = first or area
         r = proximity_reader.metric(area, first, reference_area or first, behind[..., 0].size) if first else math.nan
         row: Row = {"file": name, **_numbers(area=area, r=r)}
