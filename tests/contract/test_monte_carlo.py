@@ -323,6 +323,7 @@ def test_the_model_differentiates_by_the_renderer(bench, tmp_path, monkeypatch):
         )
 
 
+@pytest.mark.slow
 def test_a_study_is_told_of_the_error_of_its_predictions(bench, tmp_path):
     """Four times the rays and packets halve the error."""
     from optics.captures.capture_set import Captures, Frame

@@ -1085,7 +1085,11 @@ def test_everything_drawn_at_once_gives_images(seed, bench):
         assert np.isfinite(bench.derivative(key, values)).all(), key
 
 
-@pytest.mark.parametrize("name", SHIPPED)
+# All effects of these at once compile for three seconds and more: among the slow tests.
+LONG = ("9dtact", "digit", "gelsight_bench", "gelsight_mini", "particle_gel")
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in LONG else n for n in SHIPPED])
 def test_every_scene_gives_images_with_all_its_effects(name, benches):
     """Each effect that a scene can express is drawn at once: parts that stand in for another carry what they can
     compute."""

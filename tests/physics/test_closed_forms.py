@@ -729,6 +729,7 @@ def ball_image(mi, scene, spp, seed=0):
     return image[..., image.shape[-1] - 16]
 
 
+@pytest.mark.slow
 def test_the_integrating_sphere(mitsuba):
     """In a sphere every point lights every other alike: after k reflections L_k = rho^(k-1) mean(L_1), whatever lit it
     first.

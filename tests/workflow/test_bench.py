@@ -162,6 +162,7 @@ DEAR = (
         "depolarization and drift",
         "dark offset",
         "retardance along a polarizer",
+        "backlash",
     ),
 )
 
