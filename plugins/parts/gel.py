@@ -62,7 +62,7 @@ INDENTER_SIZE = 1.5  # mm
 # mm. Facets put rims of shadows a little off, by h^2/24R to h^2/8R of a ball's flank. Of four summed frames of 12 bits,
 # chi2 of 230 000 values is 760 above that of a path tracer on a far finer mesh at 0.06 mm, and 350 at 0.03 mm, most of
 # it from samples; a vignetting that is known to 0.08 % comes out 3.9 errors low at 0.06 mm, 1.1 at 0.03 mm and 0.6 at
-# 0.02 mm. A press takes a tenth longer than at 0.06 mm.
+# 0.02 mm. A press takes a fifth longer than at 0.06 mm.
 PITCH = 0.03
 BESIDE, MOST = 80, 2000  # vertices beside the fine part, where the face is nearly flat; and in all, unless stated
 DRAG = ("friction", "shift_x", "shift_y", "twist")
