@@ -5,8 +5,8 @@ distant ones do not is a sensor that changes during the session: a coating that 
 that mists over. Neither is an effect on light that presses would show, and both may pass for a curve along what
 happened to differ between frames.
 
-What differs from contact to contact, alike under every light, is the coating or the body there: no law of light follows
-it."""
+What differs from contact to contact, alike under every light, is the coating or the body there, and no law of light
+explains it."""
 
 from __future__ import annotations
 
@@ -146,7 +146,8 @@ def by_surface(model: Model, values: Values, evidence: Evidence, images: Sequenc
     place in the image or with the place in the contact: of b is taken the quadratic in the former and the mean over all
     contacts at the latter (CELLS each way) that fit best. What is left of it takes b^2 g'g from chi2, of which noise
     takes 1. The share is of the chi2 of these pixels less the number of their values. NaN where no press is seen under
-    LIGHTS lights, for fewer than MANY contacts, or without excess.
+    LIGHTS lights, for fewer than MANY contacts, or without excess. Of one press, pixels of the camera that differ look
+    the same, unless a flat field has divided them out.
 
     images   per frame (H, W, C) residual over its noise, 0 where it is not used"""
     if isinstance(evidence.spectrum, st.Sweeps):
@@ -176,16 +177,19 @@ def _contacts_of(
     place in the image; the number of the cell of the contact. own: which of the evidence's frames the press has."""
     from scipy.ndimage import label
 
-    frames = [evidence.frames[k] for k in own]
-    where = model.coordinates(values, frames[0])
-    if len({led_label(model.frames[i].parameters) for i in frames}) < LIGHTS or "contact" not in where:
+    frames = [model.frames[evidence.frames[k]] for k in own]
+    if len({led_label(f.parameters) for f in frames}) < LIGHTS:
+        return
+    where = model.coordinates(values, evidence.frames[own[0]])
+    if "contact" not in where:
         return
     numbers, several = label(np.asarray(where["contact"], bool))
     along, length, square, count = np.zeros((4, *numbers.shape))
-    for k, i in zip(own, frames):
+    for k, f in zip(own, frames):
         use = np.asarray(evidence.use[k], bool)
-        light = np.asarray(model.predict(values, [i])[0], float) - float(model.noise.black_level)
-        g, r = np.where(use, light / evidence.sigma[k], 0.0), np.where(use, images[k], 0.0).astype(float)
+        r = np.where(use, images[k], 0.0).astype(float)
+        light = np.asarray(f.image, float) - float(model.noise.black_level)
+        g = np.where(use, light / evidence.sigma[k] - r, 0.0)  # of the prediction, without its noise
         for total, product in ((along, g * r), (length, g * g), (square, r * r), (count, use)):
             total += product.sum(-1)
     for n in range(1, several + 1):
@@ -205,6 +209,7 @@ def surface_text(found: Surface) -> str:
         return ""
     return (
         f"{min(found.share, 1.0):.0%} of what is left in the {found.contacts} contacts is one brightness of each "
-        f"pixel, the same under every light ({found.rms:.1%} rms), and goes with no place in the image or in the "
-        "contact: it belongs to the coating or to the body that presses, and no law of light follows it."
+        f"pixel, the same under every light ({found.rms:.1%} rms), and depends neither on the place in the image nor "
+        "on that in the contact: it belongs to the coating, to the body that presses or, without a flat field, to the "
+        "camera's pixels, and no law of light explains it."
     )

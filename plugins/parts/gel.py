@@ -43,7 +43,7 @@ XML
     pitch float, 0.03: mm, of the fine part of the mesh
     map_pitch float, 0.03: mm, of the maps that hold the dent's shape
     extent float, 3.0: mm, half width of the fine part of the mesh and of those maps
-    columns integer, 0: vertices of the mesh along x; 0: BESIDE more than the fine part has
+    columns integer, 0: vertices of the mesh along x; 0: 80 more than the fine part has
     rows integer, 0: vertices of the mesh along y, likewise
 """
 
@@ -334,11 +334,11 @@ def build():
             self.pitch = float(props.get("pitch", PITCH))  # mm, of the fine part of the mesh
             self.map_pitch = float(props.get("map_pitch", 0.03))  # mm, of the maps that hold the dent's shape
             self.extent = float(props.get("extent", 3.0))  # mm, half width of the fine part
-            sound = max(self.pitch, 1e-9)  # what is none is refused with its axis
-            enough = min(math.ceil(2 * self.extent / sound) + BESIDE, MOST)
+            positive = max(self.pitch, 1e-9)  # `axes` refuses a pitch that is not
+            enough = min(math.ceil(2 * self.extent / positive) + BESIDE, MOST)
             self.columns, self.rows = (int(props.get(name, 0)) or enough for name in ("columns", "rows"))
             coarsest = float(props.get(self.indenter_radius, INDENTER_SIZE)) / FINE
-            if (times := min(coarseness(), max(int(coarsest / sound), 1))) > 1:
+            if (times := min(coarseness(), max(int(coarsest / positive), 1))) > 1:
                 self.pitch *= times
                 self.columns, self.rows = -(-self.columns // times), -(-self.rows // times)
             index = np.arange(self.columns * self.rows).reshape(self.rows, self.columns)

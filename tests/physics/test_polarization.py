@@ -1040,8 +1040,8 @@ def test_derivatives_by_a_complex_step_are_those_of_differences(variant):
         assert off(found, expected) < 1e-5, key
 
 
-@pytest.mark.parametrize("variant", [MONO, pytest.param(SPECTRAL, marks=pytest.mark.slow)], indirect=True)
 @pytest.mark.slow
+@pytest.mark.parametrize("variant", [MONO, SPECTRAL], indirect=True)
 @pytest.mark.parametrize("key", ["analyzer.angle", "analyzer.leak"])
 def test_forward_derivatives_of_a_render_are_those_of_differences(variant, key, tmp_path):
     """mi.render with a gradient on one parameter, in all four components; loops are differentiated where they are not

@@ -29,20 +29,21 @@ def session(change, seed=0, lights=LIGHTS):
         SimpleNamespace(name=f"led_{k}", group="plate", parameters={f"led_{n}.power": float(n == k) for n in range(6)})
         for k in range(lights)
     ]
+    shape = (SIDE, SIDE, 1)
+    left = [change(k)[..., None] * light(k) / SIGMA + rng.standard_normal(shape) for k in range(lights)]
+    for k, frame in enumerate(frames):
+        frame.image = 8.0 + light(k) + SIGMA * left[k]
     model = SimpleNamespace(
         frames=frames,
         noise=SimpleNamespace(black_level=8.0),
         coordinates=lambda values, i: {"contact": CONTACT},
-        predict=lambda values, at: [8.0 + light(i) for i in at],
     )
-    shape = (SIDE, SIDE, 1)
     evidence = SimpleNamespace(
         spectrum=None,
         frames=range(lights),
         use=[np.ones(shape, bool)] * lights,
         sigma=[np.full(shape, SIGMA)] * lights,
     )
-    left = [change(k)[..., None] * light(k) / SIGMA + rng.standard_normal(shape) for k in range(lights)]
     return model, evidence, left
 
 
