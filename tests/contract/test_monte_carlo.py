@@ -132,6 +132,7 @@ def test_derivatives_against_differences(key, bench):
     assert (np.abs(own - wide) < 6 * error + 0.05 * size).all()  # straight over a plausible change to some per cent
 
 
+@pytest.mark.slow
 def test_a_material_that_absorbs_nothing_has_its_derivative(bench):
     """At neutral, which is a bound, more absorption means less light, in proportion to the path lengths."""
     scene, renderer, values = bench
@@ -270,6 +271,7 @@ def test_scenes_that_monte_carlo_cannot_follow_are_refused(bench, tmp_path):
     assert cli.main(["sweep", "magictac", "--key", "filling.absorption", "--from", "0", "--to", "1"]) == 2
 
 
+@pytest.mark.slow
 def test_a_light_does_not_depend_on_the_others(bench):
     """A room that is off is not followed, and changes no other light's image when it is on; its image goes with its
     power."""

@@ -603,11 +603,13 @@ def test_an_effect_at_neutral_is_not_there(key, bench_of):
     check_identity(bench_of(effect), effect)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("effect", settling())
 def test_what_has_a_neutral_value_sets_in_continuously(effect, bench_of):
     check_continuity(bench_of(effect), effect)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("key", EFFECTS)
 def test_an_effect_sets_in_linearly_or_says_that_it_does_not(key, bench_of):
     effect = REGISTRY.effects[key]
@@ -809,6 +811,7 @@ def test_forward_mode_against_differences(kind, name, bench_of):
     assert check_model_derivative(bench, key, 1e-3) > 1e-7, f"{key} does nothing to the bench"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind, name", ways("difference", often=False))
 def test_differences_do_not_depend_on_their_step(kind, name, bench_of):
     bench = bench_of(kind, name)
@@ -835,6 +838,7 @@ IN_THE_FINGER = (
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("key", IN_THE_FINGER)
 def test_derivatives_behind_layers(key, bench_of):
     bench = bench_of("markers")
@@ -1431,6 +1435,7 @@ def user_bench(tmp_path, load_bench):
     return load
 
 
+@pytest.mark.slow
 def test_a_users_folder_meets_the_same_contract(user_bench):
     bench = user_bench(GOOD)
     effect = bench.scene.registry.find_effect("LED halo")

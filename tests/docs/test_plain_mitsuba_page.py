@@ -50,6 +50,7 @@ def prefixes(mitsuba):
     return found
 
 
+@pytest.mark.slow
 def test_the_table_of_paths_is_that_of_the_shipped_scenes(prefixes):
     told = re.findall(r"^\| (\w+) \| `(\w+)` \| `([\w.]+)` \|$", PAGE.read_text(encoding="utf-8"), re.MULTILINE)
     expected = [(s, part, path) for s, own in prefixes.items() for part, path in own.items() if part != path]

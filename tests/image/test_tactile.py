@@ -113,6 +113,7 @@ def tactile(max_depth, **more):
     return {"type": "tactile", "max_depth": max_depth, "interreflection": 1.0, **more}
 
 
+@pytest.mark.slow
 @BOTH
 @pytest.mark.parametrize("max_depth", [2, 4])
 def test_diffuse_surfaces_under_an_area_light(variant, max_depth):
@@ -122,6 +123,7 @@ def test_diffuse_surfaces_under_an_area_light(variant, max_depth):
     agree(scene, tactile(max_depth), {"type": "path", "max_depth": max_depth, "rr_depth": 100})
 
 
+@pytest.mark.slow
 @BOTH
 def test_an_absorbing_medium(variant):
     """A clear block of absorbing gel on the floor: exp(-sigma d) along the ray here, tracking in `volpath`."""
@@ -141,6 +143,7 @@ def test_an_absorbing_medium(variant):
     agree(scene, tactile(3), {"type": "volpath", "max_depth": 3, "rr_depth": 100})
 
 
+@pytest.mark.slow
 @BOTH
 def test_light_through_a_polarizer(variant):
     """Shadow rays pass a polarizer that is tilted against both the lamp and the camera."""
@@ -174,6 +177,7 @@ def test_an_area_light_behind_a_null_surface(variant, max_depth):
     agree(scene, tactile(max_depth), {"type": "volpath", "max_depth": max_depth, "rr_depth": 100})
 
 
+@pytest.mark.slow
 @BOTH
 def test_null_surfaces_are_not_there(variant):
     import mitsuba as mi
@@ -370,6 +374,7 @@ def test_effects_of_light_are_in_both_renders(mitsuba, tmp_path, key):
     assert change.sum() == pytest.approx(expected.sum(), rel=0.005)
 
 
+@pytest.mark.slow
 def test_bands_are_the_monochrome_renders_of_stock_path(mitsuba, tmp_path):
     """One spectral render with bands is three mono renders by `path`, each with the band's reflectance."""
     from optics.scene.mitsuba_parts import use_variant
@@ -402,6 +407,7 @@ def test_a_mono_variant_refuses_three_bands(mitsuba, tmp_path):
         use_variant()
 
 
+@pytest.mark.slow
 def test_bands_bring_no_spectral_noise(mitsuba, tmp_path):
     """A narrow LED: with bands the only noise is where in the pixel a sample falls; wavelengths by Monte Carlo mostly
     miss it."""
@@ -436,6 +442,7 @@ def test_integrals_over_the_wavelength(mitsuba, tmp_path, max_depth):
     assert least_p(flat[0] * 1.02, flat[1])[1] < 1e-6  # two percent would be noticed
 
 
+@pytest.mark.slow
 def test_integrals_take_less_time_than_wavelengths_by_monte_carlo(mitsuba):
     """Time to the same error. The limit is far from the factor of some thousands, because other processes may run."""
     from optics.proof.speed import spectral_noise

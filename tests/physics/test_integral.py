@@ -35,6 +35,7 @@ def digit(mitsuba, folder, bands, **attributes):
     return loader.load(file, {**SIZE, "bands": bands})
 
 
+@pytest.mark.slow
 def test_lines_give_what_bands_at_their_peaks_give(mitsuba, tmp_path):
     """LEDs of 1 nm at the peaks: their integrals differ from the sensitivities there by the bend of these at 530 nm,
     a kink of 3 % per 5 nm over a third of a nm."""
@@ -149,6 +150,7 @@ def test_a_straight_line_needs_two_nodes(mitsuba, tmp_path):
     assert two.error < 1e-10 and len(free.nm) <= len(two.nm)  # 1e-10: rounding of sums over 1600 places
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("key", ["led_green.wavelength", "led_red.fwhm"])
 def test_derivatives_by_peak_and_width(auto, mitsuba, tmp_path, key):
     """Auto bands: complex step through the matrix, against central differences, whose error is the third order: 1e-6

@@ -1233,6 +1233,7 @@ def test_fluorescence_of_a_marker_is_the_integral_over_the_spectra(finger):
     assert off(quarter[row, column] * 4, finger.renderer.image(values, "uv_left")[row, column]) < FLOAT32
 
 
+@pytest.mark.slow
 def test_the_render_of_the_finger_is_its_prediction(finger):
     """mi.render with lamps, layers, refraction and fluorescence together, pixel by pixel away from rims, in all
     components."""

@@ -536,6 +536,7 @@ def test_derivatives_follow_the_sampled_directions(mitsuba, name):
 
 
 # -- in a scene ------------------------------------------------------------------------------------------------------
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "integrator, stride",
     [

@@ -286,6 +286,7 @@ def test_stock_rough_dielectric_sees_the_same(tmp_path, mitsuba, roughness):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("roughness", [0.1, 0.3, 0.5])
 def test_what_rough_faces_lose(tmp_path, mitsuba, roughness):
     """Light that facets pass on to each other: of radiance 1 from everywhere a slab shows 0.4 % less at 0.3 and 7 % at
@@ -541,6 +542,7 @@ def test_a_prism_disperses(tmp_path, mitsuba, law, more):
     assert (spread > 0.3).all() and spread == pytest.approx(expected[2] - expected[0], abs=2e-3)
 
 
+@pytest.mark.slow
 def test_bands_of_different_index_are_followed_apart(tmp_path, mitsuba):
     """A plate shifts a ray by d sin(a) (1 - cos(a)/sqrt(n^2 - sin(a)^2)) (Snell), each band by its own n: 1.5 + 0.1
     ((540/nm)^2 - 1), more than any glass, so that blue and red see the edge of a screen 1.45 px apart behind a plate

@@ -296,6 +296,7 @@ def test_a_image_of_a_sensor(optics, tmp_path):
     assert np.abs(shown - np.clip(np.round(image.camera), 0, 255)).max() <= 1  # a DN on the edge of two
 
 
+@pytest.mark.slow
 def test_the_first_image_of_a_scene_is_its_first_look(optics, tmp_path):
     """With nothing set a newcomer sees a press in colour, and how; what is set, and a file of your own, mean what they
     say."""
@@ -333,6 +334,7 @@ def test_existing_images_are_kept_unless_forced(optics, tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.exr", "a.json"]
 
 
+@pytest.mark.slow
 def test_monte_carlo_agrees_within_its_own_variance(optics, tmp_path):
     for name, options in (("exact", []), ("random", ["--spp", "64", "--seed", "3"])):
         assert optics("render", "gelsight", *SIZE, "-D", "depth=0.5", *options, "-o", tmp_path / f"{name}.exr")[0] == 0
@@ -376,6 +378,7 @@ STOCK = """<scene version="3.0.0"><integrator type="path"/>
 <emitter type="constant"/></scene>"""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", ["llvm_ad_rgb", None])
 def test_any_other_mitsuba_scene(optics, tmp_path, variant):
     import trimesh
@@ -432,6 +435,7 @@ def test_compare(optics, measured, tmp_path):
     assert chi2 > 2 and right["chi2"] / right["dof"] == pytest.approx(1, abs=0.03)  # 31104 values: sd 0.008
 
 
+@pytest.mark.slow
 def test_calibrate_writes_a_study_that_compare_can_use(optics, measured, tmp_path):
     study = tmp_path / "study"
     code, out, err = optics(

@@ -59,6 +59,7 @@ def test_the_untouched_sensor_is_the_background_times_its_gain(models, mode):
     assert np.abs(model.predict(values)[0] - expected).max() < 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["multiplicative", "additive"])
 @pytest.mark.parametrize("key", KEYS)
 def test_derivatives_agree_with_differences(models, mode, key):

@@ -99,6 +99,7 @@ def test_plates_noise_and_lights_are_derived(imported):
     )
 
 
+@pytest.mark.slow
 def test_captures_have_a_flat_field_and_settings_for_each_led(imported):
     found = capture_set.load(imported.folder)
     assert [f.name for f in found.frames] == [f"{s}_{k}" for s in ("one", "two") for k in AZIMUTHS]

@@ -92,6 +92,7 @@ def test_the_error_falls_to_the_noise_on_frames_that_were_held_out(made):
     assert before.chi2 > 100 * after.chi2
 
 
+@pytest.mark.slow
 def test_an_opened_study_is_the_one_that_was_made(made):
     study, verdict, _, after, _ = made
     again = optics.Study.open(study.folder)

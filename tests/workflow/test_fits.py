@@ -144,6 +144,7 @@ def rendered(file):
     return {name: np.asarray(image) for name, image in channels.items()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frame", [None, "p1.led_3"])
 def test_a_calibrated_sensor_is_the_scene_with_its_values(touched, optics, tmp_path, frame):
     """`--fit` is the same as to name scene, definitions and every value by hand; a light shines with the power that was

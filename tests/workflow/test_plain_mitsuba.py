@@ -205,6 +205,7 @@ def test_values_and_traverse_agree(name, mi):
 
 
 # -- what cannot be wired is said ------------------------------------------------------------------------------------
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, told",
     [
