@@ -318,7 +318,13 @@ def _descend(
             stuck = len(history) > 1 and history[-2] - promise / 4 < history[-1]
             if (tries > TRIES and stuck) or (tries > 1 and best[0] < count / 2):
                 break
-        gained = descent.chord(STEPS_NEAR if near else STEPS, WORTH * least, NEAR * count if near else 0.0, PART)
+        gained = descent.chord(
+            STEPS_NEAR if near else STEPS,
+            WORTH * least,
+            NEAR * count if near else 0.0,
+            PART,
+            negligible if negligible > NEGLIGIBLE else 0.0,
+        )
         if negligible > NEGLIGIBLE and gained < negligible * excess:
             return history, f"converged to {negligible:.2g} of the misfit after {iteration + 1} linearisations"
         if gained < accuracy and not near:
@@ -408,13 +414,15 @@ def extended(
     secant: Mapping[str, float] | None = None,
     steps: int = 10,
     seed: int = 0,
+    negligible: float = 0.0,
 ) -> Fit:
     """Free further variables and calibrate everything again, by chord steps on a converged fit's derivative images.
 
     Each step costs one prediction, where `fit` would make all derivative images again: for ranking many effects. The
     extra variables' images are tangents at the base's values, or secants of the sizes in `secant`. The steps follow the
     true prediction, so the result is a true minimum along them; only its last digits and its errors are those of the
-    base's linearisation. `converged` says whether the fall that is still predicted is below 1 per variable.
+    base's linearisation. `converged` says whether the fall that is still predicted is below 1 per variable. A gain
+    below the share `negligible` of what is left beyond noise ends them.
 
     Where predictions have sampling errors, these images have samples of their own, of two seeds that belong to `seed`:
     errors that an image shared with the predictions would draw the root of J'Wr to where they are small, and the square
@@ -448,7 +456,7 @@ def extended(
     descent = Descent(model, variables, values, base.frames, damping=CHORD_DAMPING)
     descent.take(Normal(a, b + pull, base.chi2, prior, base.frame_chi2, base.frame_n, rows))
     before, promised = descent.here.total, descent.promised
-    descent.chord(steps, WORTH * p)
+    descent.chord(steps, WORTH * p, negligible=negligible)
     here = descent.here
     return Fit(
         descent.values,

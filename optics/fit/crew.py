@@ -13,7 +13,7 @@ from __future__ import annotations
 import os
 import time
 import weakref
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 START = 10.0  # seconds of images before further processes are worth their own start of about five
 MEMORY = 4e9  # bytes that a process may come to need: what a renderer keeps, twice
 AHEAD = 2  # frames that may wait until they are asked for, of each process
+BUSY = 0.7  # of the cores: one process that keeps so many busy by itself is not worth helping where presses are shared
 UNEVEN = 1.25  # of the longest share of presses over the mean, beyond which the frames of a press are shared as well
 VARIABLE = "OPTICS_PROCESSES"  # of the environment: how many processes at most
 
@@ -145,7 +146,7 @@ class Crew:
         for f in new:
             presses.setdefault(self.presses[f], []).append(f)
         own = sorted(presses.values(), key=len, reverse=True)
-        if _longest(load, own) > UNEVEN * len(frames) / self.count:
+        if _uneven(load, own, len(frames)):
             own = [[f] for f in new]
         for together in own:
             k = min(range(self.count), key=load.__getitem__)
@@ -183,12 +184,19 @@ class Crew:
             yield made.pop(f)
 
 
-def _longest(load: Sequence[int], presses: Sequence[Sequence[int]]) -> int:
-    """The longest share when presses, the largest first, go to whoever has least."""
+def _uneven(load: Sequence[int], presses: Sequence[Sequence[int]], count: int) -> bool:
+    """Whether, of so many frames, somebody would have many more than others if presses, the largest first, went whole
+    to whoever has least."""
     found = list(load)
     for own in presses:
         found[found.index(min(found))] += len(own)
-    return max(found)
+    return max(found) > UNEVEN * count / len(found)
+
+
+def _shared(presses: Sequence[int], frames: Sequence[int], processes: int) -> bool:
+    """Whether so many processes would share the frames of a press."""
+    sizes = sorted(Counter(presses[f] for f in frames).values(), reverse=True)
+    return _uneven([0] * processes, [range(size) for size in sizes], len(frames))
 
 
 # -- in the other processes ------------------------------------------------------------------------------------------
@@ -232,12 +240,13 @@ class Hands:
 
     def __init__(self) -> None:
         self.spent, self.alone = 0.0, False  # seconds of images so far; whether no other process is to be asked again
+        self.worked = 0.0  # seconds of processor time that these took
         self.crew: Crew | None = None
 
     def work(self, model: SceneModel, frames: Sequence[int], task: Task) -> Iterator[Any]:
         """What a task makes of each frame of a model, in their order."""
         done = 0
-        crew = self._crew(model, len(frames))
+        crew = self._crew(model, frames)
         if crew is not None:
             try:
                 for made in crew.run(model, frames, task):
@@ -246,16 +255,22 @@ class Hands:
             except Gone:
                 self.give_up(model)
         for frame in frames[done:]:
-            began = time.perf_counter()
+            began, before = time.perf_counter(), time.process_time()
             made = task(model, frame)
             self.spent += time.perf_counter() - began
+            self.worked += time.process_time() - before
             yield made
 
-    def _crew(self, model: SceneModel, count: int) -> Crew | None:
-        """The crew where it is at work; begun where it is time to, and where several frames are asked for."""
-        if self.crew is None and count > 1 and self.spent > START and not self.alone:
-            processes, recipe = min(allowed(), count), model.recipe
+    def _crew(self, model: SceneModel, frames: Sequence[int]) -> Crew | None:
+        """The crew where it is at work; begun where it is time to, and where several frames are asked for.
+
+        Processes that share the frames of a press each move its geometry: where Dr.Jit keeps the cores busy, they take
+        half as long again as one process (six LEDs of one press on two cores)."""
+        if self.crew is None and len(frames) > 1 and self.spent > START and not self.alone:
+            processes, recipe = min(allowed(), len(frames)), model.recipe
             if processes < 2 or recipe is None or not _shares(model):
+                return None
+            if _shared(model.presses, frames, processes) and self.worked > BUSY * cores() * self.spent:
                 return None
             self.crew = Crew(recipe, model.presses, processes)
         try:

@@ -65,6 +65,11 @@ class Normal:
         """What is minimised: chi2 of the data plus that of the priors."""
         return self.chi2 + self.prior
 
+    @property
+    def excess(self) -> float:
+        """By how much chi2 exceeds the number of values."""
+        return max(self.chi2 - sum(self.frame_n), 0.0)
+
 
 def huber(whitened: np.ndarray, limit: float = HUBER) -> np.ndarray:
     """Weights min(1, limit/|r|), by which a robust fit multiplies 1/sigma^2."""
@@ -331,7 +336,7 @@ class Descent:
         self.theta, self.values = moved, self.moved(self.values, moved)
         return True
 
-    def chord(self, steps: int, enough: float, rough: float = 0.0, part: float = 0.0) -> float:
+    def chord(self, steps: int, enough: float, rough: float = 0.0, part: float = 0.0, negligible: float = 0.0) -> float:
         """Take steps on the same derivative images; returns the total fall. At most `steps` of them are tried.
 
         Lights that move or widen change their brightness far more than their pattern, so a long step ends on the wall
@@ -342,12 +347,13 @@ class Descent:
         rough    below this promise chi2 may rise by as much as is promised: close to the optimum chi2 is rough, as
                  shadow rims cross pixels, and the root of J'Wr is followed instead
         part     share of the first promise below which a further step is worth its prediction
+        negligible   share of what is left beyond noise that is as good as nothing, besides `enough`
         """
         gained = first = 0.0
         while steps > 0:
-            promised = self.promised
+            promised, least = self.promised, max(enough, negligible * self.here.excess)
             first = first or promised
-            if promised < enough or (gained and promised > part * first > 0):
+            if promised < least or (gained and promised > part * first > 0):
                 break
             worst = -promised if promised < rough else 0.0
             found, gain, expected, tried = self._search(steps, worst)
@@ -361,7 +367,7 @@ class Descent:
             gained += gain
             self.damping = max(self.damping / EASING, LEAST_DAMPING)
             # a poor step that still gains ten times what is worth a step is better followed by new images
-            if gain < enough or 10 * enough < gain < POOR * expected:
+            if gain < least or 10 * enough < gain < POOR * expected:
                 break
         return gained
 

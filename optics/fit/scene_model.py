@@ -453,14 +453,16 @@ class SceneModel:
                 scale, share = flat / level, (linear.image - black) / level
                 prediction, gained = black + (linear.image - black) * scale, share
         images: dict[str, np.ndarray] = {}
-        image: Any
         at_once = self._light_at_once(values, now, variables, secant, index, seed)
         at = self._place_of(now, index, seed)
+        # the tangents at rest come after all others, so that the gel is brought there once
+        waiting: list[tuple[Variable, dict[str, Any], tuple | None, np.ndarray | None]] = []
         for variable in variables:
             acts = self._acts(values, variable, index)
             if not acts:
                 continue
             key = None if at is None else (secant.get(variable.name), variable.frames, *acts.items(), *at)
+            image: Any
             if key in self._derived:
                 self._derived.move_to_end(key)
                 image = self._derived[key]
@@ -472,20 +474,33 @@ class SceneModel:
                 with self.renderer.splitting(self._side(now)):
                     image = self._tangent(linear, now, acts, seed)
                 if background is not None:
-                    own = {k: f for k, f in acts.items() if not self._rests(k)}
-                    with self.renderer.splitting(self._side(at_rest)):
-                        still = self._tangent(rest, at_rest, own, seed, True)
-                    if image is not None or still is not None:
-                        image = scale * ((0 if image is None else image) - share * (0 if still is None else still))
-                        if any(self.parameters[k].how == "image" for k in acts):
-                            stepped = {**now, **{k: now[k] + 1j * STEP for k in acts}}
-                            image = image + gained * background * (self.gains(stepped).imag / STEP)
-            if image is not None:
-                image = image.astype(np.float32, copy=False)
-                images[variable.name] = np.broadcast_to(image, self.frames[index].image.shape)
-            if key is not None:
-                self._keep_derived(key, image)
+                    waiting.append((variable, acts, key, image))
+                    images[variable.name] = np.empty(0)  # holds its place
+                    continue
+            self._hold(images, variable.name, key, image, index)
+        for variable, acts, key, image in waiting:
+            own = {k: f for k, f in acts.items() if not self._rests(k)}
+            with self.renderer.splitting(self._side(at_rest)):
+                still = self._tangent(rest, at_rest, own, seed, True)
+            if image is not None or still is not None:
+                image = scale * ((0 if image is None else image) - share * (0 if still is None else still))
+                if any(self.parameters[k].how == "image" for k in acts):
+                    stepped = {**now, **{k: now[k] + 1j * STEP for k in acts}}
+                    image = image + gained * background * (self.gains(stepped).imag / STEP)
+            self._hold(images, variable.name, key, image, index)
         return prediction, images
+
+    def _hold(
+        self, images: dict[str, np.ndarray], name: str, key: tuple | None, image: np.ndarray | None, index: int
+    ) -> None:
+        """Put a derivative image among those of its frame; None: the frame has none of it."""
+        if image is not None:
+            image = image.astype(np.float32, copy=False)
+            images[name] = np.broadcast_to(image, self.frames[index].image.shape)
+        else:
+            images.pop(name, None)
+        if key is not None:
+            self._keep_derived(key, image)
 
     def _place_of(self, now: Mapping, index: int, seed: int) -> tuple | None:
         """What a derivative image of a frame depends on besides its variable; None: images of readings are not kept."""
@@ -519,7 +534,8 @@ class SceneModel:
         now = self.at(moved, index)
         if variable.name in at_once:
             return (self.developer.develop(at_once[variable.name], now) - prediction) / step
-        return (self._predict(now, index, seed) - prediction) / step
+        with self.renderer.in_passing():
+            return (self._predict(now, index, seed) - prediction) / step
 
     def _stepped(self, values: Values, variable: Variable, step: float) -> tuple[Values, float]:
         """(values with a step of a variable, the step); at a bound it goes the other way."""
@@ -666,12 +682,14 @@ class SceneModel:
     def _difference(self, now: Mapping, key: str, seed: int, component: int) -> np.ndarray:
         """Central difference of the linear image, one-sided at a bound; common samples."""
         low, high = self.parameters[key].sides(now[key])
-        first, second = (self.renderer.radiance({**now, key: value}, seed, component) for value in (low, high))
+        with self.renderer.in_passing():
+            first, second = (self.renderer.radiance({**now, key: value}, seed, component) for value in (low, high))
         return (second - first) / (high - low)
 
     def _difference_led(self, now: Mapping, led: str, key: str, component: int, seed: int = 0) -> np.ndarray:
         low, high = self.parameters[key].sides(now[key])
-        first, second = (self.renderer.image({**now, key: value}, led, component, seed) for value in (low, high))
+        with self.renderer.in_passing():
+            first, second = (self.renderer.image({**now, key: value}, led, component, seed) for value in (low, high))
         return (second - first) / (high - low)
 
     def _difference_ambient(self, now: Mapping, key: str, component: int) -> np.ndarray:

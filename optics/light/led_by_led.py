@@ -140,12 +140,20 @@ class LedByLed:
         cos = dr.maximum(mi.Frame3f.cos_theta(own), 0.0)
         return w, mi.unpolarized_spectrum(value) * weight, cos / dr.pi * weight
 
-    def bounced(self, scene, si, weight, origin, led, count, sampler, grazing=False):
-        """Radiance per band that one LED sends to the camera by two reflections, mean of `count` directions."""
+    def met_next(self, scene, si, sampler, grazing):
+        """What second directions meet: the same for every LED (detached)."""
+        with dr.suspend_grad():
+            second = scene.ray_intersect(si.spawn_ray(self.second_direction(si, sampler, grazing)[0]), si.is_valid())
+            dr.eval(second)
+        return second
+
+    def bounced(self, scene, si, weight, origin, led, count, sampler, grazing=False, met=None):
+        """Radiance per band that one LED sends to the camera by two reflections, mean of `count` directions; of one,
+        which met what `met_next` found, if that is given."""
         total = mi.UnpolarizedSpectrum(0.0)
         for _ in range(count):
             w, factor, cosine = self.second_direction(si, sampler, grazing)
-            second = scene.ray_intersect(si.spawn_ray(w), si.is_valid())
+            second = scene.ray_intersect(si.spawn_ray(w), si.is_valid()) if met is None else met
             point = led.point(sampler.next_2d()) if led.reach() > 0 else led.position()
             seen = self.visible(scene, second, point, led)
             light = factor * self.direct(scene, second, 1.0, si.p, led, seen, point)

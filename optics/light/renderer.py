@@ -140,6 +140,7 @@ class Renderer:
         self._transmissions: OrderedDict = OrderedDict()
         self._recent: list[paths.Path] = []
         self._hits: OrderedDict = OrderedDict()
+        self._second: tuple[tuple, tuple] | None = None  # what second directions meet, and of which values
         self._glow: tuple[tuple, LedImage] | None = None  # the image of light that no LED made, and of which values
         self._images: OrderedDict[tuple, LedImage] = OrderedDict()
         self._plain: OrderedDict[tuple, np.ndarray] = OrderedDict()  # of differences, which need nothing else
@@ -183,6 +184,21 @@ class Renderer:
         self._slopes: dict[tuple, tuple[LedImage, dict[str, tuple]]] = {}  # those that were made with others
         self.wanted: Pixels | None = None  # those that take finer samples where they need them; None: all
         self.side = 1  # values of a pixel each way, see `splitting`
+        self.passing = False  # whether nothing but images is kept, see `in_passing`
+
+    @contextmanager
+    def in_passing(self) -> Iterator[None]:
+        """Within it, images are kept without the ends of the camera rays that they were made from: of values to either
+        side of those at which tangents are asked for, which would push these out of the memory."""
+        before, self.passing = self.passing, True
+        try:
+            yield
+        finally:
+            self.passing = before
+            held = {id(image.hits) for image in self._images.values()}
+            for hits in self._hits.values():
+                if id(hits) not in held:
+                    hits.rims.clear()
 
     @contextmanager
     def splitting(self, side: int) -> Iterator[None]:
@@ -352,7 +368,7 @@ class Renderer:
     def forget_hits(self) -> None:
         """Release the kept hits: a search over many geometries returns to none of them."""
         self._hits.clear()
-        self._glow = None
+        self._glow = self._second = None
 
     def contact_weight(self, values: Mapping, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """1 where the gel is touched at points (x, y) in mm of any shape, 0 elsewhere; between at the rim."""
@@ -411,9 +427,13 @@ class Renderer:
             led
         }:  # moving the geometry costs more than an image: make what will be asked for next
             key = self._image_key(values, other, seed)
-            if key not in self._images and key not in self._plain:
+            if key not in self._images and self._plain_key(key) not in self._plain:
                 self._keep(key, self._render_led(hits, other, seed))
         return image
+
+    def _plain_key(self, key: tuple) -> tuple:
+        """The key of a plain image as finely as images are wanted."""
+        return key if self.side == 1 else (*key, self.side)
 
     def _placed_alike(self, key: tuple) -> LedImage | None:
         """A kept image of the same LED in the same place over the same geometry, which differs in shading alone: with
@@ -441,6 +461,11 @@ class Renderer:
         )
 
     def _keep(self, key: tuple, image: LedImage) -> LedImage:
+        if self.passing and image.radiance is not None:
+            self._keep_plain(key, image.radiance)
+            if self.side > 1:
+                self._keep_plain(self._plain_key(key), self._mix(image, image.raw, side=self.side))
+            return image
         self._images[key] = image
         while len(self._images) > self.remember * len(self.scene.lights):
             self._images.popitem(last=False)
@@ -534,14 +559,13 @@ class Renderer:
                    prefers a polarization (stage `detector`)
         """
         if not self.layered:
-            key = self._image_key(values, light, seed)
-            key = key if self.side == 1 else (*key, self.side)
+            key = self._plain_key(self._image_key(values, light, seed))
             plain = self._plain.get(key)
             if plain is None:
                 lit = self.led(values, light, seed)
-                plain = (
-                    lit.radiance if self.side == 1 else self._keep_plain(key, self._mix(lit, lit.raw, side=self.side))
-                )
+                plain = lit.radiance if self.side == 1 else self._plain.get(key)
+                if plain is None:
+                    plain = self._keep_plain(key, self._mix(lit, lit.raw, side=self.side))
             return plain if component == 0 else np.zeros_like(plain)
         image = self.led(values, light)
         pairs = zip(image.raw, self.weights(values, image, component))
@@ -1010,7 +1034,7 @@ class Renderer:
         if key in self._plain:
             return self._bounced(values, led, self._plain[key], component)
         self.apply(values)
-        sample, numbers = self._spread_rays(seed, samples)
+        sample, numbers, met = self._spread(values, seed, samples)
         for other in (led, *sorted(self.together - {led})):  # as for direct light: these will be asked for next
             own = ("bounced", seed, samples, *self._led_key(values, other))
             if other in self.scene.sources or own in self._plain:
@@ -1018,8 +1042,9 @@ class Renderer:
 
             def shade(lamp=self.scene.leds[other]):
                 self._tune(sample.si)
+                self._tune(met)
                 world, given = self._world(), Directions(numbers)
-                return self.scene.integrator.bounced(world, *sample[:3], lamp, 1, given, self.grazing)
+                return self.scene.integrator.bounced(world, *sample[:3], lamp, 1, given, self.grazing, met)
 
             rows, columns = -(-self.height // cell), -(-self.width // cell)
             coarse = self._each_band(shade, other).reshape(rows, columns, samples, self.bands).mean(2)
@@ -1027,9 +1052,21 @@ class Renderer:
             self._keep_plain(own, image[: self.height, : self.width].astype(float))
         return self._bounced(values, led, self._plain[key], component)
 
-    def _spread_rays(self, seed: int, samples: int) -> tuple[Sample, np.ndarray]:
-        """(ends of the camera rays that gather light from all around, the numbers (rays, n) that their second
-        directions are drawn by): the same for every geometry and LED."""
+    def _spread(self, values: Mapping, seed: int, samples: int) -> tuple:
+        """`_spread_rays`, and what their second directions meet, which all LEDs share; the latest is kept."""
+        key = (seed, samples, self.grazing, self.geometry(values), self._shading(values))
+        if self._second is None or self._second[0] != key:
+            self._second = None
+            sample, numbers = self._spread_rays(seed, samples)
+            self._tune(sample.si)
+            met = self.scene.integrator.met_next(self._world(), sample.si, Directions(numbers), self.grazing)
+            self._second = key, (sample, numbers, met)
+        return self._second[1]
+
+    def _spread_rays(self, seed: int, samples: int) -> tuple[Sample, list]:
+        """(ends of the camera rays that gather light from all around, the numbers that their second directions are
+        drawn by, in Dr.Jit arrays): the same for every geometry and LED."""
+        import mitsuba as mi
         from scipy.stats import qmc
 
         cell = self.bounce[0]
@@ -1042,7 +1079,7 @@ class Renderer:
         v, u = (np.repeat(a.ravel(), samples) for a in np.mgrid[:rows, :columns])
         at = [a + numbers[:, k] for k, a in enumerate((u, v))]
         sample = self._trace(*(np.minimum(a * cell, size - 1e-3) for a, size in zip(at, (self.width, self.height))))
-        return sample, numbers[:, 2:]
+        return sample, [mi.Float(column) for column in np.ascontiguousarray(numbers[:, 2:].T, np.float32)]
 
     def _bounced(self, values: Mapping, led: str, image: np.ndarray, component: int) -> np.ndarray:
         """A bounced image behind the layers."""
@@ -1098,20 +1135,18 @@ class Renderer:
 
 
 class Directions:
-    """What a sampler of Mitsuba is to `bounced`, with given numbers (rays, n) in the unit interval."""
+    """What a sampler of Mitsuba is to `bounced`, with given numbers in the unit interval: Dr.Jit arrays."""
 
-    def __init__(self, numbers: np.ndarray):
-        self._columns = iter(np.ascontiguousarray(numbers.T, np.float32))
+    def __init__(self, numbers: Iterable):
+        self._numbers = iter(numbers)
 
     def next_1d(self):
-        import mitsuba as mi
-
-        return mi.Float(next(self._columns))
+        return next(self._numbers)
 
     def next_2d(self):
         import mitsuba as mi
 
-        return mi.Point2f(mi.Float(next(self._columns)), mi.Float(next(self._columns)))
+        return mi.Point2f(next(self._numbers), next(self._numbers))
 
 
 class Sample(NamedTuple):

@@ -105,7 +105,9 @@ class Refits:
         names = tuple(v.name for v in extra)
         if names not in self.chords:
             steps = {n: self.steps[n] for n in names if n in self.steps}
-            self.chords[names] = calibrate.extended(self.model, self.base, extra, steps, seed=self.setup.seed)
+            self.chords[names] = calibrate.extended(
+                self.model, self.base, extra, steps, seed=self.setup.seed, negligible=COARSE
+            )
         return self.chords[names]
 
     def calibrated(self, variables: Sequence[Variable], extra: Sequence[Variable], frames: Sequence[int]) -> Fit:

@@ -293,6 +293,48 @@ def test_an_effect_may_do_nothing_in_a_dark_frame():
     assert [len(where) for where, *_ in base.normal.rows] == [1, 1, 1, 0] and more.converged and more.chi2 < base.chi2
 
 
+class Bent(Exact):
+    """Values of which an effect's images bend, and a pattern that no variable makes: most of chi2 stays."""
+
+    shape = (40, 50, 1)
+
+    def __init__(self):
+        rng = np.random.default_rng(4)
+        self.noise = Noise(system_gain=0.02, dark_noise=1.0, black_level=0.0, saturation=4095.0, prnu=0.0)
+        self.one, self.other, left = rng.normal(size=(3, *self.shape))
+        self.parameters = {k: Parameter(k, "1", 0.0, plausible=1.0) for k in ("lamp.x", "lens.y")}
+        self.base = {"lamp.x": 0.0, "lens.y": 0.0}
+        self.frames = [Frame("f", 100 + 20 * self.other + 40 * left + rng.normal(size=self.shape))]
+        self.predictions = 0
+
+    def predict(self, values, frames=None, seed=0):
+        self.predictions += 1
+        now = self.at(values, 0)
+        return [100 + self.one * now["lamp.x"] + self.other * (now["lens.y"] + 0.02 * now["lens.y"] ** 2)]
+
+    def variance(self, values, index, prediction):
+        return np.ones(self.shape)
+
+    def derivatives(self, values, variables, frames=None, secant=None, seed=0):
+        y = self.at(values, 0)["lens.y"]
+        slopes = {"lamp.x": self.one, "lens.y": self.other * (1 + 0.04 * y)}
+        yield self.predict(values)[0], {v.name: slopes[v.name] for v in variables}
+
+
+def test_chord_steps_end_where_they_bring_a_hundredth_of_what_stays():
+    """The fall is that of steps to the end within a hundredth of the misfit, for a part of the predictions."""
+    model = Bent()
+    x, y = (Variable(k, (k,), p) for k, p in model.parameters.items())
+    base = fit(model, [x])
+    model.predictions = 0
+    whole = extended(model, base, [y], steps=40)
+    taken, model.predictions = model.predictions, 0
+    soon = extended(model, base, [y], steps=40, negligible=0.01)
+    excess = whole.chi2 - model.frames[0].image.size
+    assert excess > 1e6 and base.chi2 - whole.chi2 > 0.1 * excess
+    assert model.predictions < taken and 0 <= soon.chi2 - whole.chi2 < 0.01 * excess
+
+
 class Sampled(Exact):
     """One frame, y = level + a (0.2 g) + e(seed) where a > 0, with the same errors e, 0.085 rms, at every a: rays that
     cross a pupil. The data are without them, and without noise; values have a noise of 1."""

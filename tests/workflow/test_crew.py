@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -82,6 +83,30 @@ def test_a_graphics_processor_has_one_process(mitsuba, monkeypatch):
     assert crews.allowed() == 1
 
 
+@pytest.mark.parametrize(
+    ("presses", "processes", "shared"),
+    [([0] * 6, 2, True), ([0, 1], 2, False), ([0, 0, 1, 1, 2, 2], 2, True), ([0, 0, 1, 1, 2, 2], 3, False)],
+)
+def test_processes_share_frames_of_a_press_where_presses_do_not_go_round(presses, processes, shared):
+    assert crews._shared(presses, range(len(presses)), processes) is shared
+
+
+@pytest.mark.parametrize(
+    ("busy", "presses", "begins"), [(1.9, [0, 0], False), (1.0, [0, 0], True), (1.9, [0, 1], True)]
+)
+def test_who_keeps_all_cores_busy_alone_shares_no_press(monkeypatch, busy, presses, begins):
+    """Two processes would both move the geometry of a press, which takes as long in each."""
+    begun = []
+    monkeypatch.setattr(crews, "allowed", lambda: 2)
+    monkeypatch.setattr(crews, "cores", lambda: 2)
+    monkeypatch.setattr(crews, "_shares", lambda model: True)
+    monkeypatch.setattr(crews, "Crew", lambda *given: begun.append(given) or SimpleNamespace(ready=lambda model: False))
+    hands = crews.Hands()
+    hands.spent, hands.worked = 2 * crews.START, busy * 2 * crews.START
+    assert hands._crew(SimpleNamespace(recipe=lambda: None, presses=presses), [0, 1]) is None
+    assert bool(begun) is begins
+
+
 @pytest.fixture(scope="module")
 def setup(tmp_path_factory, mitsuba):
     """Three presses of one to three frames, each frame under two of the six LEDs."""
@@ -108,7 +133,7 @@ def at_work(monkeypatch):
         monkeypatch.setattr(crews, "START", -1.0)
         monkeypatch.setattr(crews, "_allowed", 2)
         end = time.monotonic() + DEADLINE
-        while model.hands._crew(model, 2) is None:
+        while model.hands._crew(model, [0, 1]) is None:
             assert not model.hands.alone and time.monotonic() < end
             time.sleep(0.05)
         began.append(model)

@@ -1,0 +1,70 @@
+"""What a renderer keeps: images to either side of a geometry without their rays, and what second directions meet, for
+all lights."""
+
+import numpy as np
+import pytest
+
+from optics.light.renderer import Renderer
+from optics.scene import loader
+
+SMALL = {"width": "32", "height": "24"}
+LIGHTS = ("led_1", "led_2")
+
+
+@pytest.fixture(scope="module")
+def scene(mitsuba):
+    return loader.load("gelsight", SMALL)
+
+
+@pytest.fixture
+def values(scene):
+    return {**scene.values(), "gel.press_depth": 0.8}
+
+
+def made(renderer, values):
+    return [renderer.image(values, light) for light in LIGHTS]
+
+
+@pytest.mark.parametrize("side", (1, 2))
+def test_images_made_in_passing_are_the_same_and_push_nothing_out(scene, values, side):
+    whole, passing = Renderer(scene), Renderer(scene)
+    moved = {**values, "gel.press_x": 0.4}
+    passing.together = set(LIGHTS)
+    with whole.splitting(side), passing.splitting(side):
+        before = passing.led(values, "led_1")
+        held = list(passing._images)
+        with passing.in_passing():
+            beside = made(passing, moved)
+        assert list(passing._images) == held and passing.led(values, "led_1") is before
+        assert all(np.array_equal(a, b) for a, b in zip(beside, made(whole, moved)))
+        # the other frames of a press ask for the same images: nothing is traced for them again
+        geometry = passing.scene.gel.number("press_x")
+        passing.apply(values)
+        with passing.in_passing():
+            again = made(passing, moved)
+        assert all(a is b for a, b in zip(again, beside)) and passing.scene.gel.number("press_x") != geometry
+    kept = {id(image.hits) for image in passing._images.values()}
+    assert all(id(hits) in kept or not hits.rims for hits in passing._hits.values())
+
+
+def test_lights_share_what_second_directions_meet(scene, values, monkeypatch):
+    """The same images as where each light has its rays traced, for one trace of second directions in place of two; and
+    another where the gel or the seed is another."""
+    shared, apart = Renderer(scene), Renderer(scene)
+    integrator, traced = scene.integrator, []
+    met = type(integrator).met_next
+    monkeypatch.setattr(type(integrator), "met_next", lambda *a: traced.append(1) or met(*a))
+    found = [shared.bounced(values, light) for light in LIGHTS]
+    assert len(traced) == 1
+    whole = type(integrator).bounced
+    monkeypatch.setattr(type(integrator), "bounced", lambda self, *a: whole(self, *a[:8]))
+    for light, image in zip(LIGHTS, found):
+        wanted = apart.bounced(values, light)
+        assert wanted.max() > 0 and np.allclose(image, wanted, rtol=1e-5, atol=1e-6 * wanted.max())
+    monkeypatch.undo()
+    monkeypatch.setattr(type(integrator), "met_next", lambda *a: traced.append(1) or met(*a))
+    traced.clear()
+    shared.bounced(values, "led_1", seed=1)
+    shared.bounced({**values, "gel.press_depth": 0.5}, "led_1", seed=1)
+    shared.bounced({**values, "led_1.x": values["led_1.x"] + 1}, "led_1", seed=1)
+    assert len(traced) == 3  # the last goes back to the gel of the first
