@@ -186,7 +186,10 @@ def diagnose(
     if word in ("UNKNOWN", "CANNOT_TELL"):
         text, first = _unexplained(case, word, text, fingerprints, families, findings, basis)
         hints = [*first, *hints]
-    if leaves_misfit(best.excess_sd, basis):
+    # of one press, what is fixed in the image and what is the surface's own look the same
+    if leaves_misfit(best.excess_sd, basis) and not (
+        FIXED_HINT in hints and len(patterns.presses_of(model, evidence)) < 2
+    ):
         surface = patterns.surface_text(patterns.by_surface(model, best.fit.values, evidence, best.images))
         text, hints = " ".join(filter(None, [text, surface])), [*hints, *[SURFACE_HINT] * bool(surface)]
     return Diagnosis(

@@ -152,10 +152,7 @@ def by_surface(model: Model, values: Values, evidence: Evidence, images: Sequenc
     images   per frame (H, W, C) residual over its noise, 0 where it is not used"""
     if isinstance(evidence.spectrum, st.Sweeps):
         return Surface()
-    presses: dict[str, list[int]] = {}
-    for k, i in enumerate(evidence.frames):
-        presses.setdefault(model.frames[i].group or model.frames[i].name, []).append(k)
-    contacts = [c for own in presses.values() for c in _contacts_of(model, values, evidence, images, own)]
+    contacts = [c for own in presses_of(model, evidence) for c in _contacts_of(model, values, evidence, images, own)]
     if len(contacts) < MANY:
         return Surface()
     bright, weight, square, count, *places, cell = np.concatenate(contacts, 1)
@@ -168,6 +165,14 @@ def by_surface(model: Model, values: Values, evidence: Evidence, images: Sequenc
     taken = float(off @ off) - (len(off) - rank)
     spread = float(np.mean(off**2 / weight) - np.mean(1 / weight))
     return Surface(taken / excess, math.sqrt(max(spread, 0.0)), len(contacts))
+
+
+def presses_of(model: Model, evidence: Evidence) -> list[list[int]]:
+    """Which of the evidence's frames each press has."""
+    presses: dict[str, list[int]] = {}
+    for k, i in enumerate(evidence.frames):
+        presses.setdefault(model.frames[i].group or model.frames[i].name, []).append(k)
+    return list(presses.values())
 
 
 def _contacts_of(

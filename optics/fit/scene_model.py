@@ -682,7 +682,7 @@ class SceneModel:
     def _difference(self, now: Mapping, key: str, seed: int, component: int) -> np.ndarray:
         """Central difference of the linear image, one-sided at a bound; common samples."""
         low, high = self.parameters[key].sides(now[key])
-        with self.renderer.in_passing():
+        with self.renderer.in_passing(roughly=True):
             first, second = (self.renderer.radiance({**now, key: value}, seed, component) for value in (low, high))
         return (second - first) / (high - low)
 

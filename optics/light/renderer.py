@@ -144,6 +144,7 @@ class Renderer:
         self._glow: tuple[tuple, LedImage] | None = None  # the image of light that no LED made, and of which values
         self._images: OrderedDict[tuple, LedImage] = OrderedDict()
         self._plain: OrderedDict[tuple, np.ndarray] = OrderedDict()  # of differences, which need nothing else
+        self._plain_bytes = 0
         image_keys = {k for k, p in scene.parameters.items() if p.how == "image"}
         self.layer_keys = {k for k, p in scene.parameters.items() if p.how == "layer"}
         words = {
@@ -184,17 +185,19 @@ class Renderer:
         self._slopes: dict[tuple, tuple[LedImage, dict[str, tuple]]] = {}  # those that were made with others
         self.wanted: Pixels | None = None  # those that take finer samples where they need them; None: all
         self.side = 1  # values of a pixel each way, see `splitting`
-        self.passing = False  # whether nothing but images is kept, see `in_passing`
+        self.passing = self.roughly = False  # whether nothing but images is kept, see `in_passing`
 
     @contextmanager
-    def in_passing(self) -> Iterator[None]:
+    def in_passing(self, roughly: bool = False) -> Iterator[None]:
         """Within it, images are kept without the ends of the camera rays that they were made from: of values to either
-        side of those at which tangents are asked for, which would push these out of the memory."""
-        before, self.passing = self.passing, True
+        side of those at which tangents are asked for, which would push these out of the memory.
+
+        roughly   with ROUGHLY times fewer second directions, where both sides of a difference are made so"""
+        before, self.passing, self.roughly = (self.passing, self.roughly), True, roughly
         try:
             yield
         finally:
-            self.passing = before
+            self.passing, self.roughly = before
             held = {id(image.hits) for image in self._images.values()}
             for hits in self._hits.values():
                 if id(hits) not in held:
@@ -475,10 +478,12 @@ class Renderer:
         return image
 
     def _keep_plain(self, key: tuple, image: np.ndarray) -> np.ndarray:
+        before = self._plain.get(key)
+        self._plain_bytes += image.nbytes - (0 if before is None else before.nbytes)
         self._plain[key] = image
-        most = int(IMAGES * self.remember / REMEMBER / max(image.nbytes, 1))
-        while len(self._plain) > max(2 * len(self.scene.lights), most):
-            self._plain.popitem(last=False)
+        most = IMAGES * self.remember / REMEMBER
+        while self._plain_bytes > most and len(self._plain) > 2 * len(self.scene.lights):
+            self._plain_bytes -= self._plain.popitem(last=False)[1].nbytes
         return image
 
     def _render_led(self, hits: Hits, led: str, seed: int = 0) -> LedImage:
@@ -659,7 +664,8 @@ class Renderer:
         """(H, W, B) what one light makes at its power, by one reflection and by two."""
         image = self.image(values, light, component, seed)
         if self.bounce_key and values[self.bounce_key]:
-            image = image + values[self.bounce_key] * self.bounced(values, light, seed, component, self.rough)
+            rough = self.rough or self.roughly
+            image = image + values[self.bounce_key] * self.bounced(values, light, seed, component, rough)
         return self.powers(values, light) * image
 
     def radiance(self, values: Mapping, seed: int = 0, component: int = 0) -> np.ndarray:
@@ -1049,7 +1055,7 @@ class Renderer:
             rows, columns = -(-self.height // cell), -(-self.width // cell)
             coarse = self._each_band(shade, other).reshape(rows, columns, samples, self.bands).mean(2)
             image = zoom(coarse, (cell, cell, 1), order=1, mode="nearest", grid_mode=True)
-            self._keep_plain(own, image[: self.height, : self.width].astype(float))
+            self._keep_plain(own, image[: self.height, : self.width].astype(np.float32))
         return self._bounced(values, led, self._plain[key], component)
 
     def _spread(self, values: Mapping, seed: int, samples: int) -> tuple:

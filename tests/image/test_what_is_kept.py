@@ -68,3 +68,21 @@ def test_lights_share_what_second_directions_meet(scene, values, monkeypatch):
     shared.bounced({**values, "gel.press_depth": 0.5}, "led_1", seed=1)
     shared.bounced({**values, "led_1.x": values["led_1.x"] + 1}, "led_1", seed=1)
     assert len(traced) == 3  # the last goes back to the gel of the first
+
+
+def test_large_images_push_out_no_more_than_they_take(scene, monkeypatch):
+    """Images in parts of pixels are four times as large: what is kept is counted in bytes, the oldest go first."""
+    from optics.light import renderer as own
+
+    renderer = Renderer(scene)
+    small, large = np.zeros(100, np.float32), np.zeros(400, np.float32)
+    monkeypatch.setattr(own, "IMAGES", 100 * small.nbytes)
+    for n in range(90):
+        renderer._keep_plain((n,), small)
+    renderer._keep_plain(("large",), large)
+    assert len(renderer._plain) == 91
+    for n in range(4):
+        renderer._keep_plain(("large", n), large)
+    assert (9,) not in renderer._plain and (10,) in renderer._plain
+    renderer._keep_plain(("large", 0), large)  # made again: it takes no more
+    assert (10,) in renderer._plain and sum(i.nbytes for i in renderer._plain.values()) == renderer._plain_bytes
