@@ -149,6 +149,7 @@ def test_the_numbers_are_those_of_one_process(setup, at_work):
     """Normal equations, secants, predictions; a process that dies leaves its frames to the other. Tolerances are of
     single precision: threads of another number sum in another order, and a secant divides a difference."""
     one, two = open_model(setup), at_work(open_model(setup))
+    one.hands.alone = True  # whatever `at_work` allows
     frames = list(range(len(one.frames)))
     variables = variables_of_base(one, setup, frames)
     values = Values({"led_2.mu": 1.7}, {0: {"gel.press_x": -0.9}, 1: {"gel.press_x": -0.9}})
