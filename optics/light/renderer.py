@@ -1048,7 +1048,8 @@ class Renderer:
 
             def shade(lamp=self.scene.leds[other]):
                 self._tune(sample.si)
-                self._tune(met)
+                if met is not None:
+                    self._tune(met)
                 world, given = self._world(), Directions(numbers)
                 return self.scene.integrator.bounced(world, *sample[:3], lamp, 1, given, self.grazing, met)
 
@@ -1059,13 +1060,16 @@ class Renderer:
         return self._bounced(values, led, self._plain[key], component)
 
     def _spread(self, values: Mapping, seed: int, samples: int) -> tuple:
-        """`_spread_rays`, and what their second directions meet, which all LEDs share; the latest is kept."""
+        """`_spread_rays`, and what their second directions meet, which all LEDs share; the latest is kept. None of so
+        many rays that they would take more than a quarter of the memory: each LED then traces its own."""
         key = (seed, samples, self.grazing, self.geometry(values), self._shading(values))
         if self._second is None or self._second[0] != key:
             self._second = None
             sample, numbers = self._spread_rays(seed, samples)
             self._tune(sample.si)
-            met = self.scene.integrator.met_next(self._world(), sample.si, Directions(numbers), self.grazing)
+            met = None
+            if 4 * PER_RAY * len(numbers[0]) <= self.memory:
+                met = self.scene.integrator.met_next(self._world(), sample.si, Directions(numbers), self.grazing)
             self._second = key, (sample, numbers, met)
         return self._second[1]
 

@@ -68,6 +68,9 @@ def test_lights_share_what_second_directions_meet(scene, values, monkeypatch):
     shared.bounced({**values, "gel.press_depth": 0.5}, "led_1", seed=1)
     shared.bounced({**values, "led_1.x": values["led_1.x"] + 1}, "led_1", seed=1)
     assert len(traced) == 3  # the last goes back to the gel of the first
+    apart.memory = 0.0
+    assert np.allclose(apart.bounced(values, "led_1", seed=1), shared.bounced(values, "led_1", seed=1), rtol=1e-5)
+    assert len(traced) == 3  # where there is no memory for them, each light traces its own
 
 
 def test_large_images_push_out_no_more_than_they_take(scene, monkeypatch):
