@@ -287,6 +287,7 @@ def test_a_light_does_not_depend_on_the_others(bench):
     assert 0 < one.max() < 1e-4  # what is seen through faces has the radiance of the room or less
 
 
+@pytest.mark.slow
 def test_no_light_no_image(bench):
     scene, renderer, values = bench
     dark = {**values, **{f"{n}.power": 0.0 for n in scene.lights}}

@@ -235,7 +235,14 @@ def is_shipped(item):
     return Path(item.file).is_relative_to(shipped("plugins").resolve())
 
 
-@pytest.mark.parametrize("item", ITEMS)
+# Whose checks take seven seconds and more: among the slow tests.
+COSTLY = ("twisted-plate", "finite-layer")
+
+
+@pytest.mark.parametrize(
+    "item",
+    [pytest.param(*i.values, id=i.id, marks=[pytest.mark.slow] * (i.id.split()[-1] in COSTLY)) for i in ITEMS],
+)
 def test_plugins_meet_their_own_closed_forms(item, mitsuba):
     """Every check that the file carries; a file that ships carries one at least."""
     assert item.checks or not is_shipped(item), f"{item.file}: carries no check"
@@ -662,6 +669,7 @@ def test_a_sheet_at_rest_and_a_film_taken_out_are_not_there(benches, tmp_path):
     assert np.abs(bare.image() - bench.image(values)).max() <= IDENTITY
 
 
+@pytest.mark.slow
 def test_a_rough_boundary_of_index_1_is_not_there_in_a_render(benches, tmp_path):
     """mi.render with and without it in the sample slot, at the roughness of the working point."""
     from optics.light.rendering import RenderJob
@@ -799,7 +807,7 @@ def check_model_derivative(bench, key, tolerance, rims=False):
     return strongest
 
 
-@pytest.mark.parametrize("kind, name", ways("ad"))
+@pytest.mark.parametrize("kind, name", ways("ad", often=False))
 def test_forward_mode_against_differences(kind, name, bench_of):
     """In the image of one LED, where the parameter acts there, and in the model's."""
     bench = bench_of(kind, name)
@@ -1070,6 +1078,7 @@ def check_random_values(bench, effect, seed):
         assert image.min() > -0.02 and image.max() < 10  # an offset of one DN is 0.004
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("key", EFFECTS)
 def test_random_strengths_give_images(key, bench_of):
     effect = REGISTRY.effects[key]
@@ -1090,7 +1099,7 @@ def test_everything_drawn_at_once_gives_images(seed, bench):
 
 
 # All effects of these at once compile for three seconds and more: among the slow tests.
-LONG = ("9dtact", "digit", "gelsight_bench", "gelsight_mini", "particle_gel")
+LONG = ("9dtact", "digit", "gelsight_bench", "gelsight_mini", "particle_gel", "vi2tap")
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in LONG else n for n in SHIPPED])
@@ -1593,11 +1602,12 @@ def test_drafts_act_along_the_coordinate_that_was_diagnosed(drafts):
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name, key, tolerance",
     [
         ("incidence", "led_1.x", 2e-3),
-        pytest.param("led_distance", "led_1.z", 2e-3, marks=pytest.mark.slow),
+        ("led_distance", "led_1.z", 2e-3),
         ("half_angle", "led_1.y", 2e-3),
         (
             "led_angle",

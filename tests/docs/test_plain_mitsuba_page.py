@@ -57,6 +57,7 @@ def test_the_table_of_paths_is_that_of_the_shipped_scenes(prefixes):
     assert told == expected
 
 
+@pytest.mark.slow
 def test_the_rule_of_paths_holds(prefixes):
     for own in prefixes.values():
         for part, path in own.items():

@@ -38,6 +38,7 @@ def test_forces_of_a_gel_on_its_window():
     assert ((pressed > 0) <= (image.channels["contact.Y"] >= 0)).all() and pressed.any()
 
 
+@pytest.mark.slow
 def test_pixels_add_up_to_the_force_and_the_drag():
     job, image = taken(
         "gelsight",

@@ -239,7 +239,7 @@ def band_images(scene, spp, seeds=4, first=0):
 
 
 @BOTH
-@pytest.mark.parametrize("max_depth", [2, 3])
+@pytest.mark.parametrize("max_depth", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_a_pressed_gelsight(variant, max_depth, tmp_path):
     """Six LEDs, a dent with shadows, a rough membrane; without bands, as `path` draws its wavelengths by Monte
     Carlo."""

@@ -47,6 +47,7 @@ def test_images_made_in_passing_are_the_same_and_push_nothing_out(scene, values,
     assert all(id(hits) in kept or not hits.rims for hits in passing._hits.values())
 
 
+@pytest.mark.slow
 def test_lights_share_what_second_directions_meet(scene, values, monkeypatch):
     """The same images as where each light has its rays traced, for one trace of second directions in place of two; and
     another where the gel or the seed is another."""

@@ -199,6 +199,7 @@ def errors(mitsuba):
     return of
 
 
+@pytest.mark.slow
 def test_another_seed_has_other_errors_at_outlines(errors):
     """Two seeds are as good as one another and share none of their error; the same seed gives the same image."""
     one, other = errors({}, 0), errors({}, 1)

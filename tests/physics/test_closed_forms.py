@@ -776,6 +776,7 @@ def test_energy_is_never_created_in_a_furnace(mitsuba):
     assert directional_albedo(mi, rough, 0.7) < 1
 
 
+@pytest.mark.slow
 def test_a_fold_lights_itself_by_its_form_factor(bench, mitsuba):
     """Two wide plates at a right angle, one lit evenly: radiance of the dark one at height h is rho L (1 - cos-weighted
     factor).

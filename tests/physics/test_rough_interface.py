@@ -222,6 +222,7 @@ def test_forward_derivatives_of_every_element_are_those_of_the_formula(mitsuba, 
 
 
 # -- against Mitsuba's own boundaries --------------------------------------------------------------------------------
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "variant", ["llvm_ad_rgb", "llvm_ad_mono", "llvm_ad_mono_polarized", "llvm_ad_spectral_polarized"], indirect=True
 )

@@ -51,6 +51,7 @@ def greys_of(scene, seen):
     return found
 
 
+@pytest.mark.slow
 def test_what_powers_and_rho_leave_of_a_metameric_paint(digit):
     """With one light in each range it is all but a gain of that light; the flanks of lines 17 to 47 nm wide, which
     reach into other ranges and channels, leave 8.4 % of its image. That share by sums in steps of 1 nm, of lines as

@@ -439,6 +439,7 @@ def fields_off(was, now, g, n):
     return worst
 
 
+@pytest.mark.slow
 def test_a_facet_acts_as_a_face(tmp_path, mitsuba):
     """What a rough face leaves of fields, by the facet that sent a ray where it went; the weight is G1 of Smith for
     Beckmann's slopes, 2/(1 + erf(a) + exp(-a^2)/(a sqrt(pi))), a = 1/(alpha tan(theta)) (Walter et al. 2007), as

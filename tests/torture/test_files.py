@@ -217,6 +217,7 @@ def test_settings_of_raw_frames(mitsuba, met, tmp_path_factory, data):
         met("compare", folder / "set")
 
 
+@pytest.mark.slow
 @given(data=st.data())
 @pytest.mark.parametrize("name", ["features.npz", "map.npz"])
 def test_what_was_learnt_of_forces(material, met, tmp_path_factory, name, data):

@@ -482,6 +482,7 @@ def test_a_tie_gets_advice_that_is_written_and_read():
     assert "evidence" not in old and "fits" not in old
 
 
+@pytest.mark.slow
 def test_the_same_advice_from_the_same_data():
     model, found = tie()
     assert advise.advise(model, found, variables_of) == advise.advise(model, found, variables_of)

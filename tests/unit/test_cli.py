@@ -409,6 +409,7 @@ def test_any_other_mitsuba_scene(optics, tmp_path, variant):
         assert shown.size == (32, 24)
 
 
+@pytest.mark.slow
 def test_a_sensor_beside_other_lights_goes_through_mitsuba(optics, tmp_path):
     text = scene.find("gelsight").read_text(encoding="utf-8")
     (tmp_path / "lit.xml").write_text(text.replace("</scene>", '<emitter type="constant"/></scene>'))

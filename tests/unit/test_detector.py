@@ -57,6 +57,7 @@ def test_light_from_a_plate_shows_the_detector_without_any_film(mitsuba):
     assert found == pytest.approx((p + s) + Q * (p - s), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_images_record_the_weighed_light_and_keep_the_stokes_vectors_that_arrive(mitsuba):
     """LED by LED and by mi.render alike; S0 of the file is that of the light, and what the camera makes is not."""
     defines = {"width": 4, "height": 3, "x_fov": 4, "analyzer": 30, "bands": "540"}

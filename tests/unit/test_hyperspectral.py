@@ -135,6 +135,7 @@ def test_what_is_no_cube_is_refused(cube, tmp_path):
         hyperspectral.import_cubes(envi(tmp_path / "b.hdr", cube), tmp_path / "set", bits=8, **NUMBERS)
 
 
+@pytest.mark.slow
 def test_a_model_predicts_what_a_hyperspectral_camera_saw(mitsuba, tmp_path):
     """Radiance per nm that DIGIT sends, rendered at every 2.5 nm and blurred by bands of 15 nm in plain numpy, is what
     auto bands predict of the imported set: chi2 by the noise that was put in, and the exposure that was hidden."""

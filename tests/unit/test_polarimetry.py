@@ -239,6 +239,7 @@ def test_maps_are_grey_where_nothing_can_be_said():
 
 
 # -- readings against a parameter ------------------------------------------------------------------------------------
+@pytest.mark.slow
 def test_a_spot_is_a_pixel_of_the_image(finger):
     whole, values = Renderer(finger), {**finger.values(), "analyzer.angle": 20.0}
     picture = sum(whole.powers(values, n) * whole.image(values, n) for n in finger.lights) + whole.ambient(values)

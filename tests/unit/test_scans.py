@@ -113,6 +113,7 @@ def test_captures_have_a_flat_field_and_settings_for_each_led(imported):
     assert "dust, hair or glints" in imported.warnings[0]
 
 
+@pytest.mark.slow
 def test_the_scene_shows_the_balls_where_they_are(imported):
     """Touched where the balls are, and nowhere else; the LEDs stand where the shading says."""
     found = capture_set.load(imported.folder)

@@ -153,17 +153,8 @@ def at_the_noise(chi2_per_dof: float, count: int) -> bool:
 # Whose readings have three bands, or whose refits are dear: among the slow tests.
 DEAR = (
     *("leak", "stray light", "film reflections", "dispersive retardance", "gamma", "coloured leak", "scale", "stress"),
-    *(
-        "drift",
-        "misalignment",
-        "misalignment and leak",
-        "retardance",
-        "depolarization",
-        "depolarization and drift",
-        "dark offset",
-        "retardance along a polarizer",
-        "backlash",
-    ),
+    *("drift", "misalignment", "misalignment and leak", "retardance", "depolarization", "depolarization and drift"),
+    *("dark offset", "retardance along a polarizer", "backlash", "wobble"),
 )
 
 

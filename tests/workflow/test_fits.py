@@ -178,6 +178,7 @@ def test_a_calibrated_sensor_is_the_scene_with_its_values(touched, optics, tmp_p
         np.testing.assert_allclose(image, predicted, rtol=1e-4, atol=1e-3)  # DN; the renderer's samples are the same
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("levels, power", [(["led_1.power"], 0.9 * 1.25), ([], 0.9)])
 def test_a_drive_level_that_was_fitted_multiplies_the_power(touched, tmp_path, levels, power):
     """As `SceneModel.at` has it: what was fitted in a frame is a light's drive level where this is known with an

@@ -612,6 +612,7 @@ SHOWN = 2e-3  # relative: the page shows three or four digits
 VALUE = f"sliders.get('{VIGNETTING}').now"
 
 
+@pytest.mark.slow
 def test_an_effect_is_switched_and_slid_by_keyboard(page, model, view):
     """Filter, Tab, Space, Tab, arrows: linear while the model is busy, equal to numpy; then the render, equal to the
     model's."""
