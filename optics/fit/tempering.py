@@ -1,14 +1,14 @@
 """What is known keeps its weight while the model is wrong.
 
-    minimise chi2/T + priors,    T = 1 + a (chi2/dof - 1)
-    a = max over squares of k x k pixels of  sum of (sum of r over a square)^2 / sum of r^2
+    minimise chi2/T + priors,    T = max over squares of any side of  sum of (sum of r over a square)^2 / n
 
-with the whitened residual r of images. Chi2 knows noise alone: where a model misses images by ten times their noise, it
-would sell every prior for a little less misfit, and lights, poses and shapes run away to wherever they make up for what
-the model lacks. With the misfit's own size in place of the noise, chi2/T is about the number of values. Neighbours miss
-alike, though: a of them count as one. (Bayesian tempering, or the power likelihood, with the power that the misfit
-itself suggests: Gruenwald & van Ommen, Bayesian Analysis 12, 1069, 2017; a as the design effect of clusters, Kish,
-Survey Sampling, 1965.)
+with the n whitened residuals r of images. Chi2 knows noise alone: where a model misses images by ten times their noise,
+it would sell every prior for a little less misfit, and lights, poses and shapes run away to wherever they make up for
+what the model lacks. With the misfit's own size in place of the noise, chi2/T is about the number of values. Neighbours
+miss alike, though, and parameters act on many of them: what counts is by how much the sum over a square varies more
+than one of noise, whose squares add up to n for any side. A misfit far below the noise of one pixel is far above that
+of a thousand. (Bayesian tempering, or the power likelihood, with the power that the misfit itself suggests: Gruenwald &
+van Ommen, Bayesian Analysis 12, 1069, 2017; the design effect of clusters, Kish, Survey Sampling, 1965.)
 
 Minimising chi2 + T priors is the same, so that T is a weight of the priors (`Variable.weight`), and all else stays. A
 model that misses nothing has T = 1."""
@@ -23,30 +23,38 @@ import numpy as np
 from optics.fit.model import Model
 from optics.scene.parameter import Values, Variable
 
-SQUARES = (1, 2, 4, 8, 16, 32)  # px: sides of squares in which neighbours may miss alike
+# Of an image's shorter side, the largest square in which neighbours may miss alike; smaller ones have halves of it. In
+# shares of the image, since one that is binned must weigh what is known as one that is not.
+LARGEST = 1 / 4
 NOISE = 5.0  # standard deviations of chi2: a smaller excess is no misfit
 
 
 def temperature(model: Model, values: Values, frames: Sequence[int], dof: int) -> float:
     """T of the images of these frames at these values; 1 where nothing but noise is left."""
-    square, whole, sums = 0.0, 0, dict.fromkeys(SQUARES, 0.0)
+    square, whole, sums = 0.0, 0, dict.fromkeys(sides(min(np.asarray(model.frames[frames[0]].image).shape[:2])), 0.0)
     for index, prediction in zip(frames, model.predict(values, frames)):
         usable = np.broadcast_to(model.usable(index), prediction.shape)
         sd = np.sqrt(model.variance(values, index, prediction))
         r = np.where(usable, (model.frames[index].image - prediction) / sd, 0.0)
         square, whole = square + float(np.sum(r**2)), whole + int(usable.sum())
-        for side in SQUARES:
+        for side in sums:
             height, width = (n // side * side for n in r.shape[:2])
-            if not height * width:
-                continue
             blocks = r[:height, :width].reshape(height // side, side, width // side, side, -1).sum((1, 3))
             sums[side] += float(np.sum(blocks**2))
     dof = min(dof, whole)
     excess = square - dof
     if not excess > NOISE * np.sqrt(2 * max(dof, 1)):
         return 1.0
-    alike = max(1.0, *(found / square for found in sums.values()))
-    return float(1 + alike * excess / dof)
+    return float(1 + (max(sums.values()) - whole) / dof)
+
+
+def sides(shorter: int) -> list[int]:
+    """px, sides of the squares: a quarter of an image's shorter side, an eighth, ... one pixel."""
+    found, side = [], max(round(LARGEST * shorter), 1)
+    while side:
+        found.append(side)
+        side //= 2
+    return found
 
 
 def tempered(variables: Sequence[Variable], weight: float) -> list[Variable]:

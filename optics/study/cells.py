@@ -21,6 +21,7 @@ from optics.study.setup import Setup, definitions_of
 
 LARGE = 60_000  # usable values of the fitted frames, above which they are put into cells: some minutes of a diagnosis
 LARGEST_CELL = 4  # px each way: the dent of a ball that covers fifty pixels still covers a hundred cells
+FINER = 3  # times: from the cells of one model in which a calibration begins to those of the next
 SMALLEST = 24  # cells along the shorter side of an image
 IN_PIXELS = {"px": 1, "px^2": 2}  # unit -> its power of a length in pixels
 IN_CELLS = {"px": "cell", "px^2": "cell^2"}  # what a diagnosis says of numbers in cells
@@ -87,15 +88,17 @@ class Cells:
         return Values(pixels(values.common), {i: pixels(own) for i, own in values.frame.items()})
 
 
-def cells_for(model: SceneModel, fitted: Sequence[int], variables: Sequence[Variable]) -> Cells | None:
-    """The cells in which a study's fitted frames are diagnosed; None where these are small, or cannot be put into
-    cells: readings, raw mosaics, scenes of Monte Carlo estimates, and scenes whose size in pixels is fixed, or whose
-    frames or priors state something in pixels."""
+def cells_for(
+    model: SceneModel, fitted: Sequence[int], variables: Sequence[Variable], largest: int = LARGEST_CELL
+) -> Cells | None:
+    """The cells, of at most `largest` pixels each way, in which a study's fitted frames are diagnosed; None where these
+    are small, or cannot be put into cells: readings, raw mosaics, scenes of Monte Carlo estimates, and scenes whose
+    size in pixels is fixed, or whose frames or priors state something in pixels."""
     captures, camera = model.captures, model.scene.camera
     values = sum(int(model.usable(i).sum()) for i in fitted)
     if values <= LARGE or captures.table is not None or captures.cfa or captures.mosaic or model.monte_carlo:
         return None
-    k = min(math.ceil(math.sqrt(values / LARGE)), LARGEST_CELL, min(camera.resolution) // SMALLEST)
+    k = min(math.ceil(math.sqrt(values / LARGE)), largest, min(camera.resolution) // SMALLEST)
     if k < 2:
         return None
     found = Cells(model, k)
@@ -106,6 +109,20 @@ def cells_for(model: SceneModel, fitted: Sequence[int], variables: Sequence[Vari
     priors = {key for v in variables if v.prior is not None for key in v.keys}
     if any(found.turns(key) for key in by_frame | priors):
         return None
+    return found
+
+
+def coarser_models(
+    model: SceneModel, setup: Setup, fitted: Sequence[int], variables: Sequence[Variable]
+) -> list[tuple[SceneModel, Cells]]:
+    """The models in cells in which a calibration of large images begins, the coarsest first; none where cells would
+    be smaller than FINER pixels, which saves nothing, or cannot be made (`cells_for`)."""
+    cells, found = cells_for(model, fitted, variables, min(model.scene.camera.resolution)), []
+    k = cells.k if cells is not None else 1
+    while k >= FINER:
+        cells = Cells(model, k)
+        found.append((open_in_cells(setup, cells)[0], cells))
+        k //= FINER
     return found
 
 

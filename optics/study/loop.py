@@ -15,6 +15,7 @@ import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +42,7 @@ from optics.scene.registry import Registry
 from optics.scene.trust import Named
 from optics.study import checks, places
 from optics.study.calibrated import origin_of
-from optics.study.cells import Cells, cells_for, open_in_cells
+from optics.study.cells import Cells, cells_for, coarser_models, open_in_cells
 from optics.study.record import Record
 from optics.study.refits import Refits
 from optics.study.setup import (
@@ -62,6 +63,7 @@ from optics.study.stages import (
     comparison_of,
     cooled,
     fit_base,
+    fit_from_cells,
     held_out_values,
     null_models,
     off_neutral,
@@ -125,9 +127,14 @@ def begin(
     clock = time.perf_counter()
     with record.alone():
         try:
-            start = Values(dict(setup.values))
+            start, robust = Values(dict(setup.values)), setup.robust
+            coarser = coarser_models(model, setup, fitted, variables)
             with model.where_used():
-                found = fit_base(model, variables, fitted, start, progress, robust=setup.robust, tempering=True)
+                if coarser:
+                    own = partial(variables_of_base, setup=setup, frames=fitted)
+                    found = fit_from_cells(model, coarser, own, fitted, start, progress, robust)
+                else:
+                    found = fit_base(model, variables, fitted, start, progress, robust=robust, tempering=True)
             write_step(record, model, "base", None, found, held, time.perf_counter() - clock)
         except BaseException:
             record.discard()

@@ -14,6 +14,7 @@ from optics.fit.result import Fit
 from optics.fit.scene_model import SceneModel
 from optics.fit.tempering import temperature, tempered, weight_of
 from optics.scene.parameter import Values, Variable
+from optics.study.cells import Cells
 from optics.study.shown import cell_of
 
 Progress = Callable[[str, int, int], None]
@@ -94,6 +95,52 @@ def fit_base(
     found = settled(model, found, robust, progress, tolerance)
     found.start = begun
     return found
+
+
+def fit_from_cells(
+    model: SceneModel,
+    coarser: Sequence[tuple[SceneModel, Cells]],
+    variables: Callable[[SceneModel], list[Variable]],
+    fitted: Sequence[int],
+    start: Values,
+    progress: Progress | None = None,
+    robust: bool = False,
+) -> Fit:
+    """`fit_base` of large images: its three stages in the first of some models in cells, then everything together in
+    one after the other, and in pixels.
+
+    coarser     (model, its cells), the largest first; variables: those of a model, alike in all
+    start       in pixels
+
+    What is far off moves in a small part of the time, and over hills of chi2 that fine detail makes."""
+    values, begun = start, np.array([value_of(model, start, v) for v in variables(model)])
+    for k, (one, cells) in enumerate(coarser):
+        own = cells.values_into(values)
+        with one.where_used():
+            found = (
+                fit_base(one, variables(one), fitted, own, progress, robust=robust, tempering=True)
+                if k == 0
+                else _together(one, variables(one), fitted, own, progress, robust)
+            )
+        values = cells.values_back(found.values)
+    found = _together(model, variables(model), fitted, values, progress, robust)
+    found.start = begun
+    return found
+
+
+def _together(
+    model: SceneModel,
+    variables: Sequence[Variable],
+    fitted: Sequence[int],
+    start: Values,
+    progress: Progress | None,
+    robust: bool,
+) -> Fit:
+    """Everything calibrated together from values that are close, with priors that count as the misfit asks."""
+    dof = sum(int(model.usable(i).sum()) for i in fitted) - len(variables)
+    weighed = tempered(variables, temperature(model, start, fitted, dof))
+    options: dict[str, Any] = {"tolerance": TOGETHER, "negligible": SAME, "robust": robust, "progress": progress}
+    return cooled(model, calibrate.fit(model, weighed, start, fitted, **options), robust, progress)
 
 
 def settled(

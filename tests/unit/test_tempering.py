@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from optics.fit.tempering import temperature, tempered, weight_of
+from optics.fit.tempering import sides, temperature, tempered, weight_of
 from optics.scene.parameter import Parameter, Values, Variable
 
 SIZE = (64, 96, 1)
@@ -33,7 +33,7 @@ def test_noise_is_no_misfit():
 
 def test_neighbours_that_miss_alike_count_once():
     """An excess of 8 per value: alone in each pixel T = 9, in squares of 4 x 4 px sixteen times the excess. The scatter
-    of 6144 values of chi2, and of 384 squares, is 2 % and 7 %; squares of 32 px that happen to add up are 6."""
+    of 6144 values of chi2, and of 384 squares, is 2 % and 7 %; squares of 16 px that happen to add up are 6."""
     alone = temperature(model_of(noise(1, 3.0)), Values(), [0], 6144)
     assert 8.5 < alone < 3 * 9
     squares = np.random.default_rng(2).normal(0, 8**0.5, (16, 24, 1))
@@ -42,13 +42,37 @@ def test_neighbours_that_miss_alike_count_once():
     assert 0.7 * 16 * 8 < found < 3 * 16 * 8
 
 
-def test_images_smaller_than_a_square():
+def test_images_smaller_than_four_squares():
+    """Of 5 x 7 px the largest square is one pixel: neighbours are not asked."""
     image = 3.0 * np.ones((5, 7, 1))
     model = model_of(image)
     model.predict, model.variance = (lambda *_: [np.zeros((5, 7, 1))]), (lambda *_: np.ones((5, 7, 1)))
     model.usable = lambda frame: np.ones((5, 7, 1), bool)
-    # of squares of 4 x 4 px one fits: 16^2 9 of 35 9
-    assert temperature(model, Values(), [0], 35) == pytest.approx(1 + 16**2 / 35 * 8)
+    assert temperature(model, Values(), [0], 35) == pytest.approx(9)
+
+
+def test_squares_are_shares_of_the_image():
+    assert (sides(128), sides(256), sides(60)) == ([32, 16, 8, 4, 2, 1], [64, 32, 16, 8, 4, 2, 1], [15, 7, 3, 1])
+    assert sides(1) == [1]
+
+
+@pytest.mark.parametrize("k", [2, 4])
+def test_an_image_that_is_binned_weighs_what_is_known_alike(k):
+    """The same misfit, smooth over an eighth of the image, seen by four times k^2 pixels whose noise is k times as
+    large: without that, a fit of finer pixels would run from its priors. T is 1500; the noise in it is 2 %."""
+    coarse = np.kron(np.random.default_rng(4).normal(0, 4, (8, 12, 1)), np.ones((8, 8, 1)))
+    fine = np.kron(coarse / k, np.ones((k, k, 1)))
+    found = []
+    for image in (coarse, fine):
+        shape = image.shape
+        model = SimpleNamespace(
+            frames=[SimpleNamespace(image=image + np.random.default_rng(5).normal(0, 1, shape))],
+            predict=lambda *_, shape=shape: [np.zeros(shape)],
+            variance=lambda *_, shape=shape: np.ones(shape),
+            usable=lambda _, shape=shape: np.ones(shape, bool),
+        )
+        found.append(temperature(model, Values(), [0], image.size))
+    assert found[1] == pytest.approx(found[0], rel=0.1)
 
 
 def test_a_prior_weighs_more_and_says_the_same():

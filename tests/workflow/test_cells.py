@@ -18,6 +18,7 @@ from optics.proof.makers import touch
 from optics.scene import loader
 from optics.scene.parameter import Parameter, Values, Variable
 from optics.study import cells as cells_of_studies
+from optics.study import loop
 from optics.study.cells import Cells
 from optics.study.refits import Refits
 from optics.study.setup import Setup
@@ -149,19 +150,64 @@ def test_chord_steps_that_stopped_short_of_a_promise_are_calibrated(monkeypatch,
     assert (found.reason == "converged") == calibrated and found.chi2 == (40.0 if calibrated else 84.0)
 
 
-@pytest.mark.slow
-def test_a_verdict_in_cells(mitsuba, tmp_path, monkeypatch):
-    """Images by stock Mitsuba with one effect and a principal point off the middle, whose sides are no multiple of a
-    cell: the effect is claimed in cells, and values are in pixels again."""
-    hidden, strength = "lens vignetting", demo.SECRETS["lens vignetting"]
+def touched(folder, hidden, strength):
+    """Captures of three presses under two LEDs by stock Mitsuba, with one effect, and the values that are known."""
     scene = loader.load("gelsight", {"width": "65", "height": "49"})
     built = {**demo.truth(scene, 4), "camera.exposure": demo.SENSORS["gelsight"][1]}
     maker = touch.Maker(scene, built, {hidden: strength}, demo.CAMERA, 1004, spp=32, frames=demo.FRAMES)
     drives = [{led: 1.0} for led in list(scene.leds)[:2]]
     shot = maker.captures(touch.presses(3, 4), drives, scene_name="gelsight")
     shot.parameters["camera.exposure"] = built["camera.exposure"]
-    capture_set.write(shot, tmp_path / "captures", bits=16)
+    capture_set.write(shot, folder, bits=16)
+    return built
 
+
+@pytest.mark.slow
+def test_a_calibration_that_begins_in_cells_ends_where_one_in_pixels_does(mitsuba, tmp_path, monkeypatch):
+    """Of images that the model misses, as an effect is hidden: with the same chi2, and at most half as many
+    linearisations in pixels. A principal point is in pixels."""
+    built = touched(tmp_path / "captures", "lens vignetting", 0.1 * demo.SECRETS["lens vignetting"])
+    started = {**built, "led_1.x": built["led_1.x"] + 0.5}
+    setup = Setup(
+        str(tmp_path / "captures"),
+        values=started,
+        free=["led_1.[xyz]", "led_*.power", "membrane.sigma", "camera.principal_x"],
+        held_out=["press-02"],
+    )
+    counted, of_model = [], calibrate.fit
+
+    def fit(model, variables, values, frames, **options):
+        found = of_model(model, variables, values, frames, **options)
+        counted.append((model.shape[:2], len(found.history)))
+        return found
+
+    ends, in_pixels = [], []
+    monkeypatch.setattr(cells_of_studies, "SMALLEST", 16)
+    for large in (10**6, 1500):
+        monkeypatch.setattr(cells_of_studies, "LARGE", large)
+        counted.clear()
+        with monkeypatch.context() as patched:
+            patched.setattr(calibrate, "fit", fit)
+            _, model, found = loop.begin(setup, tmp_path / f"study-{large}")
+        ends.append(found)
+        in_pixels.append(sum(n for shape, n in counted if shape == model.shape[:2]))
+        assert any(shape != model.shape[:2] for shape, _ in counted) == (large == 1500)
+    direct, begun = ends
+    assert direct.chi2 / direct.dof > 1.2  # it does miss
+    # each ends where a step promises less than 2e-4 of the excess, along valleys with a few such steps ahead
+    assert begun.chi2 == pytest.approx(direct.chi2, rel=0, abs=3e-3 * (direct.chi2 - direct.dof))
+    assert in_pixels[1] <= in_pixels[0] / 2
+    assert begun.values.common["camera.principal_x"] == pytest.approx(
+        direct.values.common["camera.principal_x"], abs=0.01
+    )
+
+
+@pytest.mark.slow
+def test_a_verdict_in_cells(mitsuba, tmp_path, monkeypatch):
+    """Images by stock Mitsuba with one effect and a principal point off the middle, whose sides are no multiple of a
+    cell: the effect is claimed in cells, and values are in pixels again."""
+    hidden, strength = "lens vignetting", demo.SECRETS["lens vignetting"]
+    built = touched(tmp_path / "captures", hidden, strength)
     free = ["led_1.power", "led_2.power", "membrane.sigma", "camera.principal_x"]
     study = facade.calibrate(tmp_path / "captures", tmp_path / "study", free=free, values=built, held_out=["press-02"])
     monkeypatch.setattr(cells_of_studies, "LARGE", 10_000)
