@@ -60,7 +60,7 @@ class Findings:
     left         misfit over mean signal with the best explanation
     uneven       largest h of the winner's splits, by the split uneven_by (in words), uneven_limit allowed; even:
                  whether all its splits hold; some_even: whether those of any survivor do
-    held_out     fall on held-out frames, NaN where there are none
+    held_out     fall on held-out frames, NaN where there are none; p_both: p_winner of the two falls together
     ahead        fall of chi2 on blocks of readings that were left out in turn; NaN for images
     clear        of the winner's strength from none, in standard deviations; NaN where they are unknown
     far          of it, in plausible sizes; at_end: at which end of its range it stands, in words; '' for none
@@ -107,6 +107,7 @@ class Findings:
     even: bool = True
     some_even: bool = True
     held_out: float = math.nan
+    p_both: float = math.nan
     ahead: float = math.nan
     clear: float = math.nan
     far: float = 0.0
@@ -133,6 +134,12 @@ class Findings:
     def structured(self) -> bool:
         """Whether the base model leaves structure, or more than a noise that repeats have measured."""
         return is_structured(self.structure_p, self.excess_sd) or (self.measured and self.weighed)
+
+    @property
+    def refuted(self) -> bool:
+        """Whether held-out frames take back what made the winner significant. Where it hardly acts, chi2 may rise or
+        fall by a little there, and says nothing."""
+        return self.held_out <= 0 and not self.p_both < LEVEL
 
     @property
     def weighed(self) -> bool:
@@ -195,7 +202,7 @@ def _word_of_winner(f: Findings, failed: set[str]) -> str:
     """The word for the winner, given the names of its conditions that failed; '' where it decides nothing."""
     if not failed:
         return "CLAIM"
-    refuted = {"held out"} if f.held_out <= 0 else set()
+    refuted = {"held out"} if f.refuted else set()
     if failed & {"significant", "strength", CLUTTER, *refuted} and not f.structured and not f.weighed:
         # The refit did not bring the fall that the score promised, or the base's own calibration brought it; or the
         # strength scatters as much between parts of the data; or frames that took no part do not know of it.
@@ -371,7 +378,9 @@ def _of_the_strength(f: Findings) -> list[Condition]:
             f.held_out > 0 or (math.isnan(f.held_out) and f.ahead > 0),
             ("no frames were held out" if math.isnan(f.ahead) else "no frames were held out, but blocks of readings")
             if math.isnan(f.held_out)
-            else f"chi2 of held-out frames falls by {f.held_out:.3g}",
+            else f"chi2 of held-out frames falls by {f.held_out:.3g}"
+            if f.held_out > 0 or f.refuted
+            else f"chi2 of held-out frames rises by {-f.held_out:.2g}, too little to refute it, and does not verify it",
         ),
     ]
     if not math.isnan(f.ahead):

@@ -860,8 +860,9 @@ def _lead(case: Case, outcome: Outcome, best: Trial, other: Trial) -> tuple[floa
     cost, is_table = other.cost - best.cost, case.evidence.is_table
     data = other.deviance - best.deviance
     shared = other.gain - best.gain
-    if best.by_frame and not is_table and not other.bare:
-        # a lamp that swings as nobody would let it is no rival of a gain of each frame, but the same
+    if best.by_frame and not is_table and not (other.bare and _adds_to_noise(other, outcome.base)):
+        # a lamp that swings as nobody would let it is no rival of a gain of each frame, but the same; nor is one that
+        # swings a little beside effects that explain nothing
         data, shared = data + shared, 0.0
     lamp = shared
     if not is_table:

@@ -179,11 +179,12 @@ def _of_subject(
     lead, needed, against = lead_without(case, outcome, subject)
     carried, carried_by = _carried(case, outcome, subject)
     strength = [value_of(case.model, best.fit.values, v) for v in subject.variables]
+    fall, held_out = fall_over_noise(case, outcome, name), levels[-1].fall if len(levels) > 1 else math.nan
     return Findings(
         table.p_best,
         basis.structure_p,
         name,
-        table.family.p(float(subject.cone.p(fall_over_noise(case, outcome, name)))),
+        table.family.p(float(subject.cone.p(fall))),
         best.fall - best.expectation,
         common=name in outcome.core,
         shared=outcome.shared,
@@ -199,7 +200,8 @@ def _of_subject(
         uneven_limit=worst.limit if worst else UNEVEN,
         even=all(s.holds for s in mine),
         some_even=any(even) if even else True,
-        held_out=levels[-1].fall if len(levels) > 1 else math.nan,
+        held_out=held_out,
+        p_both=table.family.p(float(subject.cone.p(max(fall + held_out / outcome.scale, 0.0)))),
         ahead=-best.ahead,
         clear=clear(best.fit, subject, strength),
         far=_far(subject, strength),

@@ -112,6 +112,8 @@ def split(
 
     results = [replace(s, limit=most(s), holds=s.h <= most(s)) for s in results]
     told = added if table else whole
+    if c.effect.scope == "frame":  # frames do not scatter about strengths that each has for itself
+        places = [{name: values for name, values in p.items() if name != "frame"} for p in places]
     chance, clutter, errors = scatter(told.own, told.calibrated, told.effect, told.change, places, net)
     if added is not told:  # errors are those of a fit without a lamp; whether it is there is asked beside that lamp
         chance, *_ = scatter(added.own, added.calibrated, added.effect, _at_optimum(added), places, over_noise)
@@ -393,9 +395,12 @@ def by_clutter(score: np.ndarray, information: np.ndarray, variances: Sequence[t
     """p of a score u (k,) of information V by its variance B between G parts: the largest p of all maps, NaN without.
 
     Where G >= 2 k: T2 = u' B^-1 u, T2 (G - k)/(k (G - 1)) ~ F(k, G - k). Fewer parts determine too little of B's
-    directions (15 strengths and 16 parts would need T2 = 1.4e6), but its trace: with M = V^-1/2 B V^-1/2, F = u' V^-1 u
-    / tr M ~ F(h, h (G - 1)), h = (tr M)^2 / tr M^2. Combinations of strengths of which V holds only rounding (VISIBLE),
-    such as a gain common to all frames beside lights, are left out.
+    directions (15 strengths and 16 parts would need T2 = 1.4e6), but its trace and how it scatters along u: with z =
+    V^-1/2 u and M = V^-1/2 B V^-1/2, z'z / tr M ~ F(h, h (G - 1)), h = (tr M)^2 / tr M^2, and (z'z)^2 / (k z'Mz), which
+    is below F(k, G - 1) wherever M is no multiple of 1, for z lies where M is large. The first is weak where M is
+    large in one direction and u in others, such as the level of a lamp that one pair of frames shares; the smaller p
+    counts twice. Combinations of strengths of which V holds only rounding (VISIBLE), such as a gain common to all
+    frames beside lights, are left out.
 
     Source: Brunner, Dette & Munk, Box-type approximations in nonparametric factorial designs, J. Am. Stat. Assoc. 92,
     1494 (1997)."""
@@ -411,8 +416,10 @@ def by_clutter(score: np.ndarray, information: np.ndarray, variances: Sequence[t
         if parts >= 2 * k:
             ps.append(float(fisher.sf(np.sum(z**2 / spread) * (parts - k) / (k * (parts - 1)), k, parts - k)))
         else:
-            h = spread.sum() ** 2 / np.sum(spread**2)
-            ps.append(float(fisher.sf(z @ z / spread.sum(), h, h * (parts - 1))))
+            h, square = spread.sum() ** 2 / np.sum(spread**2), float(z @ z)
+            whole = float(fisher.sf(square / spread.sum(), h, h * (parts - 1)))
+            along = float(fisher.sf(square**2 / max(k * float(z**2 @ spread), 1e-300), k, parts - 1))
+            ps.append(min(2 * min(whole, along), 1.0))
     return max(ps, default=math.nan)
 
 

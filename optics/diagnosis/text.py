@@ -172,7 +172,7 @@ def _nothing(f: Findings, tested: int) -> str:
         how = f"family-wise p {p_text(f.p_family)}"
     elif not f.p_winner < LEVEL:
         how = f"after refit, family-wise p {p_text(f.p_winner)}"
-    elif f.held_out <= 0 and not (f.clear < STRENGTH or f.chance >= LEVEL):
+    elif f.refuted and not (f.clear < STRENGTH or f.chance >= LEVEL):
         how = f"the best, {f.winner}, raises chi2 of the held-out frames by {-f.held_out:.2g}"
     elif not f.chance > LEVEL:
         how = f"after refit, the best, {f.winner}, has a strength of {f.clear:.2g} sd"
