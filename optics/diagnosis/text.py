@@ -38,6 +38,7 @@ from optics.words import (
     with_sd,
 )
 
+MOST = 0.9  # of the excess: explanations of less are not all that is missing, and the verdict says so
 LEAST = 0.1  # D with the best shots, below which these leave two effects as alike as they are
 # what to check where no effect brings the model near its images
 AT_FAULT = (
@@ -247,6 +248,8 @@ def _ambiguous(f: Findings, explanations: Sequence[Explanation]) -> str:
     other = f" By other weights or masks {f.fragile} does better." if f.fragile else ""
     if f.untried:
         other += f" By its score {f.untried[0]} may explain more, and was not calibrated."
+    if f.weighed and f.share < MOST:
+        other += f" The best explains {share_text(f.share)} of the excess misfit; the rest has another cause."
     if f.shared:
         return (
             "the data do not decide between noise that neighbours in the session share, such as a lamp whose power "
@@ -270,7 +273,7 @@ def _ambiguous(f: Findings, explanations: Sequence[Explanation]) -> str:
         )
     if len(kinds[0]) > 1:
         return f"one law explains the residual, under {len(kinds[0])} names (fall of chi2): {names}.{other}"
-    return f"these explain the residual: {names}.{other or ' The data do not tell what else would.'}"
+    return f"the best explanation (fall of chi2) is {names}, but it is not clearly ahead.{other}"
 
 
 def _kind(kind: Sequence[Explanation]) -> str:

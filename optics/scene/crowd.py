@@ -128,13 +128,17 @@ class Traced:
         self._front.parameters_changed([])
 
     def enter(self, o: Any, d: Any, wavelengths: Any) -> tuple:
-        """Rays behind the flat interfaces between the camera and all else, and what these leave of their light."""
+        """Rays behind the flat interfaces between the camera and all else, and what these leave of their light.
+
+        They start a ball's diameter before the last interface, as if what they saw from behind it went on: a press may
+        push a ball a little through, and a ray that starts within it would see its far side."""
         import drjit as dr
         import mitsuba as mi
 
         weight: Any = mi.UnpolarizedSpectrum(1.0)
         if all(window.number("index") == 1 for window in self.windows):
             return o, d, weight
+        room: Any = mi.Float(0.0)  # before the last interface
         for _ in self.windows:
             ray: Any = mi.Ray3f(mi.Point3f(o), mi.Vector3f(d))
             ray.wavelengths = wavelengths
@@ -144,7 +148,9 @@ class Traced:
             d = dr.select(flat, si.to_world(bs.wo), d)
             o = dr.select(flat, si.p + d * (BEYOND * (1 + dr.max(dr.abs(si.p)))), o)
             weight = dr.select(flat, weight * mi.unpolarized_spectrum(passed), weight)
-        return o, d, weight
+            room = dr.select(flat, si.t, room)
+        widest = 2 * max((float(np.max(crowd.radii)) for crowd in self.crowds), default=0.0)
+        return o - d * dr.minimum(widest, room), d, weight
 
     def sharpen(self, si, origin):
         for crowd in self.crowds:
