@@ -186,13 +186,15 @@ def test_a_lamp_rules_out_nothing_that_leaves_less_where_misfit_is_left(monkeypa
     assert (lead > needed) is ruled_out
 
 
-@pytest.mark.parametrize("bare, ruled_out", [(True, False), (False, True)])
-def test_what_leaves_an_unnoticed_lamp_is_a_rival_of_gains_of_each_frame(monkeypatch, bare, ruled_out):
+@pytest.mark.parametrize("bare, brings, ruled_out", [(True, 400.0, False), (False, 400.0, True), (True, 0.001, True)])
+def test_what_leaves_an_unnoticed_lamp_is_a_rival_of_gains_of_each_frame(monkeypatch, bare, brings, ruled_out):
     """A gain of each frame leads a polarized detector by 3 in score; without the lamp that wanders beside the detector,
-    by 1000. A lamp that nobody notices is noise, one that swings is the same as those gains."""
+    by 1000. A lamp that nobody notices is noise, one that swings is the same as those gains. If the detector explains
+    nothing beside that lamp, it is no rival, whatever the lamp does."""
 
     def trial(name, deviance, gain, by_frame):
         values = {"keys": {name}, "deviance": deviance, "gain": gain, "by_frame": by_frame, "fall": 5000.0 - deviance}
+        values["members"] = [SimpleNamespace(cone=SimpleNamespace(live=[0]))]
         return SimpleNamespace(**values, cost=20.0, complete=True, bare=bare, fit=SimpleNamespace(values=0.0))
 
     best, other = trial("gains", 1000.0, 0.0, True), trial("detector", 1003.0, 997.0, False)
@@ -200,7 +202,8 @@ def test_what_leaves_an_unnoticed_lamp_is_a_rival_of_gains_of_each_frame(monkeyp
         evidence=SimpleNamespace(is_table=False), prior_chi2=lambda values: 0.0, known_chi2=lambda values: 0.0
     )
     monkeypatch.setattr(explanations, "_design_effect", lambda *a: 1.0)
-    lead, needed = explanations._lead(case, SimpleNamespace(scale=1.0), best, other)
+    outcome = SimpleNamespace(scale=1.0, base=SimpleNamespace(deviance=1003.0 + brings))
+    lead, needed = explanations._lead(case, outcome, best, other)
     assert (lead > needed) is ruled_out
 
 
