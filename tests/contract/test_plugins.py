@@ -1099,7 +1099,7 @@ def test_everything_drawn_at_once_gives_images(seed, bench):
 
 
 # All effects of these at once compile for three seconds and more: among the slow tests.
-LONG = ("9dtact", "digit", "gelsight_bench", "gelsight_mini", "particle_gel", "vi2tap")
+LONG = ("9dtact", "colour_bench", "digit", "gelsight_bench", "gelsight_mini", "particle_gel", "vi2tap")
 
 
 @pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in LONG else n for n in SHIPPED])

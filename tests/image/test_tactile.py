@@ -195,6 +195,7 @@ def test_null_surfaces_are_not_there(variant):
     assert np.median(np.abs(with_sheet - without)) <= 1e-5 * without.max()
 
 
+@pytest.mark.slow
 def test_the_comparison_notices_two_percent(mitsuba):
     """What the tests above would say of a medium that absorbs 2 % too much, or of a bounce that is missing."""
     mi = mitsuba
@@ -247,6 +248,7 @@ def test_a_pressed_gelsight(variant, max_depth, tmp_path):
     agree(scene.mitsuba, tactile(max_depth), {"type": "path", "max_depth": max_depth, "rr_depth": 100})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("variant", [MONO], indirect=True)
 def test_a_window_of_index_1_takes_no_depth_and_no_light(variant, tmp_path):
     """Stock `path` counts the way through the window as a bounce; `tactile` does not."""
@@ -264,6 +266,7 @@ def test_interreflection_scales_the_second_bounce_alone(mitsuba):
     assert min(least_p(half, (once + twice) / 2)) > SIGNIFICANCE / 10
 
 
+@pytest.mark.slow
 def test_led_by_led_is_what_the_integrator_renders(mitsuba, tmp_path):
     """Renderer.led at four times the resolution, averaged, against mi.render with `tactile`, per band."""
     from optics.light.renderer import Renderer
@@ -425,7 +428,8 @@ def test_bands_bring_no_spectral_noise(mitsuba, tmp_path):
 
 
 # -- channels as integrals over the wavelength -----------------------------------------------------------------------
-@pytest.mark.parametrize("max_depth", [2, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("max_depth", [2, 3])
 def test_integrals_over_the_wavelength(mitsuba, tmp_path, max_depth):
     """A white LED, two paints, a camera's three curves: 24 Gauss nodes, whose error is told as 2.8e-5, against
     wavelengths by Monte Carlo."""

@@ -101,6 +101,7 @@ def test_a_narrow_load_against_quadratic_elements():
     np.testing.assert_allclose(found, wanted, atol=0.008 * np.abs(wanted).max())
 
 
+@pytest.mark.slow
 def test_a_ball_against_finer_elements(skin, ball):
     """The force at two places between nodes and a depth at which elements of 1 mm resolve the contact."""
     fine = Skin(SMALL[:3], (24, 20, 4), *SMALL[3:5])

@@ -55,6 +55,7 @@ def auto(mitsuba, tmp_path_factory):
     return digit(mitsuba, tmp_path_factory.mktemp("auto"), "auto")
 
 
+@pytest.mark.slow
 def test_few_nodes_give_what_many_bands_give(mitsuba, auto, tmp_path):
     """Ten bands in place of 161, whose trapezium rule of 2.5 nm errs by 3e-4 at the kinks of the sensitivities, which
     are straight lines over 5 nm."""

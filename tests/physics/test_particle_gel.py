@@ -146,6 +146,7 @@ def test_an_image_does_not_depend_on_those_before_it(load):
 SMALL = {"width": 12, "height": 12, "x_fov": 20, "beads": 12, "field": 6, "diameter": 1.2, "top": 0.65, "bottom": 3.85}
 
 
+@pytest.mark.slow
 def test_derivatives_have_fewer_samples(load):
     """A quarter of those at an outline, but no fewer than 64, four times as many behind a pupil; others stay four. The
     image is the same within what samples err: 256 of a step err by less than 1/64 of it, 64 by less than 1/16."""

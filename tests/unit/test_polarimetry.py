@@ -287,6 +287,7 @@ def test_other_parameters_and_their_ends(bench):
         polarimetry.span(bench, "sample.stress_pattern", 0, 1)
 
 
+@pytest.mark.slow
 def test_effects_that_mix_pixels_see_the_whole_image(finger):
     values = {"camera.glare": 0.2, "camera.exposure": 3.0}
     found = polarimetry.sweep(finger, "analyzer.angle", [0.0, 90.0], (24, 18), values)

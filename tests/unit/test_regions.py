@@ -124,6 +124,7 @@ def test_photographs_use_all_pixels_but_those_at_bright_edges_that_cross_them(mi
     assert 0 < lost.sum() < 30 and cut.renderer.hits(cut.at(Values(), 2)).edges[lost].all()
 
 
+@pytest.mark.slow
 def test_mi_render_sees_the_same_regions(mitsuba, folder):
     scene = loader.load("polariscope", {"width": W, "height": H, "regions": str(folder / "map.png")})
     values = {**scene.values(), **VALUES, "analyzer.angle": 35.0}

@@ -583,6 +583,7 @@ def test_without_on_the_command_line(mitsuba, tmp_path, capsys):
     assert "retardance (left out on request)" in said and "dark offset (left out on request)" in said
 
 
+@pytest.mark.slow
 def test_a_fit_predicts_readings_of_another_session(mitsuba, tmp_path):
     """Neither session says where its meter ends; that the second is never as bright as the first changes no power."""
     import optics

@@ -213,6 +213,7 @@ def test_a_scene_without_a_camera_is_refused(tag, kind, tmp_path, capsys):
     assert code == 2 and out == "" and f"no part of the type '{kind}'" in err and err.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_nothing_is_planned_for_effects_that_are_solved_for_already(tmp_path):
     with pytest.raises(Underdetermined, match="solves for them already"):
         design.plan(

@@ -121,6 +121,7 @@ def test_a_study_is_not_overwritten_and_its_setup_is_checked(made, tmp_path):
     assert not (tmp_path / "s").exists()
 
 
+@pytest.mark.slow
 def test_options_are_those_of_the_command_line(made, request, tmp_path):
     """The same study from Python and from the command line, with the same choices."""
     captures, run = made[-1], request.getfixturevalue("optics")
@@ -154,6 +155,7 @@ def test_records_are_plain(made):
     assert isinstance(row["change"], float)  # one strength is a number, not a list of one
 
 
+@pytest.mark.slow
 def test_charts_are_figures_that_no_window_knows(made):
     from matplotlib import pyplot
     from matplotlib.figure import Figure

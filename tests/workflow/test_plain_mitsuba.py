@@ -234,6 +234,7 @@ SHEETS = """<scene version="3.0.0">
 </scene>"""
 
 
+@pytest.mark.slow
 def test_shapes_that_move_are_not_joined_by_mitsubas_optimization(mi, tmp_path):
     """Equal materials become one; the shapes that have it stay what they are."""
     path = tmp_path / "two.xml"

@@ -27,6 +27,7 @@ def frames(rng):
 HEAD = ('[parameters]\n"camera.x_fov" = 4.0\n"polarizer.angle" = 0.0', f'[uncertainty]\n"analyzer.angle" = {DIAL}')
 
 
+@pytest.mark.slow
 def test_curvature_of_angles_against_chi2(mitsuba, between_films, tmp_path):
     rng = np.random.default_rng(5)
     setup = loop.Setup(captures=str(between_films(tmp_path / "set", frames(rng), HEAD, rng)), free=["source.power"])

@@ -218,6 +218,7 @@ def test_rows_are_the_misfit_of_the_linear_prediction(ask, model, view):
         )  # sums of 5000 float32 products
 
 
+@pytest.mark.slow
 def test_best_is_least_squares_over_the_fitted_frames(ask, view):
     """The deltas of the effect alone, and with all that the study calibrated, priors included."""
     held = {"led_1.power": 1.02 * view.sliders["led_1.power"].value}
@@ -885,6 +886,7 @@ def opened(chromium, folder):
     assert chromium.errors == []
 
 
+@pytest.mark.slow
 def test_point_readings_are_drawn_as_points(chromium, mitsuba, tmp_path):
     """A bench with a leak: its linear prediction in the page is the server's, and the points move."""
     from optics.proof.makers import bench as jones
