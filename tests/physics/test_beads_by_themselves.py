@@ -59,8 +59,8 @@ def test_the_mesh_follows_when_it_is_asked_for(load):
 
 def test_an_interface_of_the_same_index_hides_no_ball_that_a_press_pushed_through(load):
     """The half-space of a deep press moves low balls through the base, by a hundredth of a millimetre or more. An index
-    of 1 + 1e-6 there changes rounding alone: 2e-4 of the image, as outlines move by 1e-4 px. Rays that began within
-    such a ball saw its far side: 19 %."""
+    of 1 + 1e-6 there changes rounding alone, by 2e-4 of the image. Rays that began within such a ball saw its far
+    side: 18 %."""
     from optics.light.renderer import Renderer
 
     scene = load(

@@ -58,8 +58,8 @@ def test_squares_are_shares_of_the_image():
 
 @pytest.mark.parametrize("k", [2, 4])
 def test_an_image_that_is_binned_weighs_what_is_known_alike(k):
-    """The same misfit, smooth over an eighth of the image, seen by four times k^2 pixels whose noise is k times as
-    large: without that, a fit of finer pixels would run from its priors. T is 1500; the noise in it is 2 %."""
+    """The same misfit, alike over an eighth of the image, seen by k^2 times as many pixels, each with k times the
+    noise: if T fell with finer pixels, their fits would run from the priors. T is 1400, by noise 2 % more or less."""
     coarse = np.kron(np.random.default_rng(4).normal(0, 4, (8, 12, 1)), np.ones((8, 8, 1)))
     fine = np.kron(coarse / k, np.ones((k, k, 1)))
     found = []

@@ -341,10 +341,8 @@ GOOD = Findings(
         ({"held_out": -3.0, "structure_p": 0.5, "excess_sd": 1.0}, "NOTHING"),  # noise, fitted
         ({"held_out": -3.0, "structure_p": 0.5, "excess_sd": 1.0, "measured": True}, "NOTHING"),
         ({"held_out": -3.0, "p_both": 0.2, "structure_p": 0.5, "excess_sd": 1.0}, "NOTHING"),  # they take it back
-        (
-            {"held_out": -0.4, "p_both": 1e-12, "structure_p": 0.5, "excess_sd": 1.0},
-            "CANNOT_TELL",
-        ),  # it hardly acts there
+        # it hardly acts there
+        ({"held_out": -0.4, "p_both": 1e-12, "structure_p": 0.5, "excess_sd": 1.0}, "CANNOT_TELL"),
         ({"held_out": -3.0, "structure_p": 0.5, "excess_sd": 27.0, "measured": True}, "CANNOT_TELL"),
         ({"held_out": math.nan, "structure_p": 0.5, "excess_sd": 1.0}, "CANNOT_TELL"),
         ({"held_out": math.nan}, "CANNOT_TELL"),
@@ -598,8 +596,8 @@ def test_as_many_strengths_as_parts_are_held_against_clutter(count):
 
 def test_a_direction_that_scatters_does_not_hide_the_others():
     """12 strengths, of which one combination scatters 128 times as much as noise between 16 parts, as the level of a
-    lamp that only two frames share did. The others are 15 sd from none each: by the trace alone p was .3 %, times 39
-    effects no claim. Without an effect .01 is kept. 500 sets, to three sd."""
+    lamp that only two frames share did. The others are 15 sd from none each, which by the trace alone is significant
+    among 39 effects in half of the sets. Without an effect .01 is kept. 500 sets, to three sd."""
     rng, count = np.random.default_rng(5), 12
     turn = np.linalg.qr(rng.standard_normal((count, count)))[0]
     sizes = np.sqrt(np.r_[128.0, np.ones(count - 1)])
