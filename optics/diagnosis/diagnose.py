@@ -283,6 +283,7 @@ def _split(case: Case, outcome: Outcome, subject: Candidate | None, basis: Basis
             beside,
             explanations.noise_of(case, outcome, trial),
             explanations.fall_beside(outcome, trial, main.effect.name) - main.cone.expectation,
+            candidates=case.table.order,
         )
         splits += own
         if not case.evidence.is_table:  # refits of readings are linearised where they end

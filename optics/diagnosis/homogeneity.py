@@ -1,7 +1,5 @@
-"""Homogeneity: whether a strength is the same in all parts of the data, and whether it is more than clutter makes.
-
-Noise is independent from pixel to pixel; clutter is not: neighbours share mottle, a fixed pattern, a drifting lamp. A
-strength is therefore compared with its scatter between parts of the sensor, or of the session, besides its noise."""
+"""Homogeneity: whether a strength is the same in all parts of the data, and whether it is more than clutter makes
+(`optics.diagnosis.clutter`)."""
 
 from __future__ import annotations
 
@@ -13,11 +11,12 @@ import numpy as np
 
 from optics.diagnosis import fingerprints as prints
 from optics.diagnosis import statistics as st
+from optics.diagnosis.clutter import Others, by_clutter, variances
 from optics.diagnosis.correlation import Correlation
 from optics.diagnosis.evidence import Block, Candidate, Evidence, Progress, at_bound, measure
 from optics.diagnosis.result import Explanation, Refit, Split
 from optics.diagnosis.session import Frames, Session
-from optics.diagnosis.thresholds import LEVEL, MAPS, UNEVEN
+from optics.diagnosis.thresholds import LEVEL, UNEVEN
 from optics.fit.compare import led_label
 from optics.fit.model import Model, value_of
 from optics.fit.result import Fit
@@ -28,16 +27,14 @@ EVEN = 0.05  # of the fall: what splitting may gain where the scatter of clutter
 # not its cause.
 SAME_PLACE = 0.5
 HAIR = 0.01  # of the fall: a split that gains less says nothing about what the effect is
-FRAMES = 6  # from which their scatter says something of a strength that all of them have
-PARTS = 16  # of the sensor or session: wider than clutter is correlated, enough for a variance
 
 
 @dataclass
 class Added:
     """A fitted effect with the evidence at its values.
 
-    own         columns of the base, of what was added beside, and of the effect
-    calibrated  those but the effect's; effect: the effect's
+    own         columns of the base, of what was added beside, of the effect, and of images the other candidates
+    calibrated  those of the base and of what was added beside; effect, others: of the effect, of the others
     change      (k,) of its strengths from where they started
     images      per block, the whitened difference (n,) that the effect makes; again: the same of other samples, where
                 these are Monte Carlo estimates, for products in which their noise does not add up
@@ -50,6 +47,7 @@ class Added:
     own: Evidence
     calibrated: list[int]
     effect: list[int]
+    others: list[int]
     change: np.ndarray
     images: list[np.ndarray]
     again: list[np.ndarray]
@@ -72,6 +70,7 @@ def split(
     beside: Sequence[Variable] = (),
     noise: Correlation | None = None,
     over_noise: float = 0.0,
+    candidates: Sequence[Candidate] = (),
 ) -> tuple[list[Split], float, np.ndarray, np.ndarray]:
     """Whether a fitted effect has the same strength in every part of the data, and `scatter` of its strength.
 
@@ -84,8 +83,9 @@ def split(
     noise    what neighbouring readings, or the pixels of a frame, share of it: a lamp that wanders differs from frame
              to frame, and so would a strength that takes up what the lamp did
     over_noise   net fall of chi2 beside that noise, of images
+    candidates   all that were scored: of images, those that are not in the fit say what clutter there is
     """
-    added = _added(model, evidence, rows_max, seed, say, c, found, net, beside)
+    added = _added(model, evidence, rows_max, seed, say, c, found, net, beside, candidates)
     dof = max(evidence.normal.count - evidence.projected.rank, 1)
     table = evidence.is_table
     if not table and left.structure_p >= LEVEL:
@@ -114,9 +114,10 @@ def split(
     told = added if table else whole
     if c.effect.scope == "frame":  # frames do not scatter about strengths that each has for itself
         places = [{name: values for name, values in p.items() if name != "frame"} for p in places]
-    chance, clutter, errors = scatter(told.own, told.calibrated, told.effect, told.change, places, net)
+    chance, clutter, errors = scatter(told.own, told.calibrated, told.effect, told.change, places, net, told.others)
     if added is not told:  # errors are those of a fit without a lamp; whether it is there is asked beside that lamp
-        chance, *_ = scatter(added.own, added.calibrated, added.effect, _at_optimum(added), places, over_noise)
+        change = _at_optimum(added)
+        chance, *_ = scatter(added.own, added.calibrated, added.effect, change, places, over_noise, added.others)
     return results, chance, clutter, errors
 
 
@@ -144,6 +145,7 @@ def _added(
     found: Fit,
     net: float,
     beside: Sequence[Variable],
+    candidates: Sequence[Candidate],
 ) -> Added:
     """Measure again at the values with the effect."""
     base = [
@@ -158,6 +160,7 @@ def _added(
     effect = [i for i, v in enumerate(base) if v in c.variables]
     calibrated = [i for i in own.base if i not in effect]
     own.precision, own.pull = own.precision[calibrated], own.pull[calibrated]  # effect variables follow the base's
+    others = _with_others(own, evidence, candidates, {v.name for v in base})
     without = found.values.copy()
     for v, start in zip(c.variables, c.start):
         without.put(v, float(start))
@@ -171,7 +174,31 @@ def _added(
 
     first = images(own.seed)
     twice = any(block.b is not None for block in own.blocks)
-    return Added(c.effect.name, own, calibrated, effect, change, first, images(own.seed + 1) if twice else first, net)
+    again = images(own.seed + 1) if twice else first
+    return Added(c.effect.name, own, calibrated, effect, others, change, first, again, net)
+
+
+def _with_others(own: Evidence, evidence: Evidence, candidates: Sequence[Candidate], taken: set[str]) -> list[int]:
+    """Columns that are added to the evidence of images: of the candidates whose variables are not `taken`, at the
+    values of the base; none where both do not use the same pixels."""
+    alike = all(np.array_equal(one.index, other.index) for one, other in zip(own.blocks, evidence.blocks))
+    if own.is_table or not alike:
+        return []
+    free = [c for c in candidates if not {v.name for v in c.variables} & taken]
+    there = list(dict.fromkeys(column for c in free for column in c.columns))
+    first = len(own.columns)
+    added = list(range(first, first + len(there)))
+    own.columns = [*own.columns, *(evidence.columns[i] for i in there)]
+    own.blocks = [
+        replace(
+            block,
+            where=np.concatenate([block.where, added]).astype(int),
+            a=np.column_stack([block.a, more]),
+            b=None if block.b is None else np.column_stack([block.b, more]),
+        )
+        for block, more in zip(own.blocks, (block.columns(there) for block in evidence.blocks))
+    ]
+    return added
 
 
 def _of_independent_readings(model: Model, added: Added, noise: Correlation) -> Added:
@@ -314,9 +341,12 @@ def scatter(
     change: np.ndarray,
     places: list[dict],
     fall: float = 0.0,
+    others: Sequence[int] = (),
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """(p, covariance that clutter adds, covariance of noise) of a strength by its scatter between parts of the sensor
     or session.
+
+    others     columns of effects that are not there, which say what clutter there is
 
     fall       of chi2 with it. It counts where it is more than the square of the strength over its error: that error
                may be one of what it multiplies, such as the power of a lamp that only shows through a leak
@@ -329,7 +359,8 @@ def scatter(
     white = st.root(projected.information, st.VISIBLE)
     covariance = white.T @ white
     images = _off_base(own, [block.columns(effect) for block in own.blocks], projected, calibrated)
-    found = variances(images, [block.r for block in own.blocks], places)
+    left = [block.r for block in own.blocks]
+    found = variances(images, left, places)
     for b, parts in found:
         if st.inverse(white @ b @ white.T)[1] < parts - 1:
             clutter = max(
@@ -341,6 +372,11 @@ def scatter(
     square = float(score @ change)
     if 0 < square < fall:
         score = score * math.sqrt(fall / square)
+    if others:
+        base = [*calibrated, *effect]
+        rest = own.project(own.thinned(), base, others, own.thinning)
+        beside = _off_base(own, [block.columns(others) for block in own.blocks], rest, base)
+        found = Others(beside, left, places).join(images, found)
     return by_clutter(score, projected.information, found), clutter, covariance
 
 
@@ -349,78 +385,6 @@ def _off_base(
 ) -> list[np.ndarray]:
     """Images of each block after projecting off what the base absorbs."""
     return [image + block.columns(base) @ projected.response for block, image in zip(own.blocks, images)]
-
-
-def variances(
-    images: Sequence[np.ndarray], left: Sequence[np.ndarray], places: list[dict]
-) -> list[tuple[np.ndarray, int]]:
-    """(B, G) for each of MAPS that there is, and for frames: the variance of the score x'r of images x, by its scatter
-    between G parts.
-
-    B = sum of w w' with w = (1 - V_g/V)^(-1/2) u_g, u_g = sum of x r over part g, V_g of x x', where r is the residual
-    at the optimum. The fit has absorbed a share V_g/V of part g, so that without clutter the mean of B is V. Where a
-    fit stopped short of the optimum, or followed other images than these, the residuals `left` are brought there first:
-    a part with nearly all information would otherwise show that rest many times over.
-
-    Source: Liang & Zeger, Longitudinal data analysis using generalized linear models, Biometrika 73, 13 (1986), the
-    robust variance; Bell & McCaffrey, Bias reduction in standard errors for linear regression with multi-stage samples,
-    Survey Methodology 28, 169 (2002)."""
-    found, k = [], images[0].shape[1]
-    root = st.root(sum(x.T @ x for x in images))
-    back = np.linalg.pinv(root)
-    rest = root.T @ root @ sum(x.T @ r for x, r in zip(images, left))
-    left = [r - x @ rest for x, r in zip(images, left)]
-    by_frame = () if "reading" in places[0] else ("frame",)  # of readings, those of a frame are no neighbours
-    for name in (*MAPS, *by_frame):
-        edges = st.bin_edges(np.concatenate([p[name] for p in places]), PARTS) if name in places[0] else None
-        if edges is None or (name == "frame" and len(places) < FRAMES):
-            continue
-        b, parts = np.zeros((k, k)), 0
-        bins = [np.searchsorted(edges, place[name], side="right") - 1 for place in places]
-        for g in range(len(edges) - 1):
-            own = np.concatenate([x[part == g] for x, part in zip(images, bins)])
-            if not own.any():
-                continue
-            score = own.T @ np.concatenate([r[part == g] for r, part in zip(left, bins)])
-            share, vectors = np.linalg.eigh(root @ (own.T @ own) @ root.T)
-            # a direction that one part alone determines has no scatter
-            free = np.where(share < 1 - 1e-6, np.maximum(1 - share, 1e-6) ** -0.5, 0.0)
-            w = back @ (vectors * free) @ (vectors.T @ (root @ score))
-            b, parts = b + np.outer(w, w), parts + 1
-        found.append((b, parts))
-    return found
-
-
-def by_clutter(score: np.ndarray, information: np.ndarray, variances: Sequence[tuple[np.ndarray, int]]) -> float:
-    """p of a score u (k,) of information V by its variance B between G parts: the largest p of all maps, NaN without.
-
-    Where G >= 2 k: T2 = u' B^-1 u, T2 (G - k)/(k (G - 1)) ~ F(k, G - k). Fewer parts determine too little of B's
-    directions (15 strengths and 16 parts would need T2 = 1.4e6), but its trace and how it scatters along u: with z =
-    V^-1/2 u and M = V^-1/2 B V^-1/2, z'z / tr M ~ F(h, h (G - 1)), h = (tr M)^2 / tr M^2, and (z'z)^2 / (k z'Mz), which
-    is below F(k, G - 1) wherever M is no multiple of 1, for z lies where M is large. The first is weak where M is
-    large in one direction and u in others, such as the level of a lamp that one pair of frames shares; the smaller p
-    counts twice. Combinations of strengths of which V holds only rounding (VISIBLE), such as a gain common to all
-    frames beside lights, are left out.
-
-    Source: Brunner, Dette & Munk, Box-type approximations in nonparametric factorial designs, J. Am. Stat. Assoc. 92,
-    1494 (1997)."""
-    from scipy.stats import f as fisher
-
-    ps, white = [], st.root(information, st.VISIBLE)
-    for b, parts in variances:
-        spread, vectors = np.linalg.eigh(white @ b @ white.T)
-        known = spread > st.TRUNCATION * max(spread.max(initial=0.0), 1e-300)
-        spread, z, k = spread[known], vectors[:, known].T @ white @ score, int(known.sum())
-        if not k or parts < 3:
-            continue
-        if parts >= 2 * k:
-            ps.append(float(fisher.sf(np.sum(z**2 / spread) * (parts - k) / (k * (parts - 1)), k, parts - k)))
-        else:
-            h, square = spread.sum() ** 2 / np.sum(spread**2), float(z @ z)
-            whole = float(fisher.sf(square / spread.sum(), h, h * (parts - 1)))
-            along = float(fisher.sf(square**2 / max(k * float(z**2 @ spread), 1e-300), k, parts - 1))
-            ps.append(min(2 * min(whole, along), 1.0))
-    return max(ps, default=math.nan)
 
 
 def _parts(model: Model, evidence: Evidence, places: list[dict]) -> dict[str, tuple[list[str], list[np.ndarray]]]:

@@ -523,6 +523,27 @@ def test_a_strength_is_held_against_what_neighbours_share():
     assert abs(np.mean(np.abs(pulls) < 2) - 0.92) < 0.047
 
 
+def test_every_other_effect_says_what_clutter_there_is(monkeypatch):
+    """A column for each of their strengths, with the claimed effect and all that is calibrated projected off."""
+    asked = []
+
+    class Spy(homogeneity.Others):
+        def __init__(self, images, left, places):
+            asked.append((images, left))
+            super().__init__(images, left, places)
+
+    monkeypatch.setattr(homogeneity, "Others", Spy)
+    d = judge(*calibrated({"vignetting": 0.3}, seed=2))
+    assert d.missing == "vignetting"
+    others = sum(len(row.variables) for row in d.rows if row.name != "vignetting")
+    assert others >= 12 and asked
+    for images, left in asked:
+        assert [len(x) for x in images] == [len(r) for r in left] and len(images) == len(FITTED)
+        assert {x.shape[1] for x in images} == {others}
+        score, power = sum(x.T @ r for x, r in zip(images, left)), sum((x**2).sum(0) for x in images)
+        assert np.all(score**2 / power < 16)  # four errors: nothing is there but noise
+
+
 def test_errors_are_those_of_where_a_strength_was_found():
     """Chord steps know the image of a leak at the base's lamp alone; where it was found, only the product with the
     lamp's power shows, and its error is ten times as large. A smaller one changes nothing."""
@@ -545,94 +566,6 @@ def test_a_fall_says_more_than_a_strength_whose_error_is_its_factors(fall, lower
     own.precision, own.pull = own.precision[:1], own.pull[:1]
     p = homogeneity.scatter(own, [0], [1], np.array([3 * fit.sd[1]]), [{"place": place}], fall)[0]
     assert (p < 1e-6) is lower and (lower or p > 1e-3)
-
-
-@pytest.mark.slow
-def test_a_lamp_that_wanders_does_not_pass_for_a_tone_of_the_session():
-    """600 readings, a wander that 50 neighbours share, as strong as noise, and a tone of 240 readings, as of a second
-    dial. By noise most sets would show it, by the scatter between 16 parts 4 % do at .01 (2000 sets), 7 % between 64.
-    1000 sets, to three sd."""
-    from scipy.ndimage import gaussian_filter1d
-
-    count = 600
-    rng, order, ps, noise = np.random.default_rng(9), np.arange(count, dtype=float), [], []
-    tone = np.cos(2 * np.pi * order / 240)[:, None]
-    tone -= tone.mean()
-    power = float(np.sum(tone**2))
-    for _ in range(1000):
-        wander = gaussian_filter1d(rng.standard_normal(count), 15, mode="wrap")
-        y = wander / wander.std() + rng.standard_normal(count)
-        y -= y.mean()
-        score = tone.T @ y
-        left = y - tone @ score / power
-        noise.append(score[0] ** 2 / power > 6.63)
-        ps.append(
-            homogeneity.by_clutter(
-                score, np.array([[power]]), homogeneity.variances([tone], [left], [{"reading": order}])
-            )
-        )
-    assert np.mean(noise) > 0.6 and np.mean(np.array(ps) < 0.01) < 0.055
-
-
-@pytest.mark.parametrize("count", [2, 8, 15, 20])
-def test_as_many_strengths_as_parts_are_held_against_clutter(count):
-    """A strength per frame, each with its own clutter in 16 parts of the sensor, .1 to 10 times that of noise. Without
-    one, .05 and .01 are kept; one of ten sd (of noise and clutter) in each is beyond it in nine of ten sets. 500 sets,
-    to three sd."""
-    rng = np.random.default_rng(count)
-    information = np.diag(10.0 ** rng.uniform(-2, 2, count))  # in units as they come
-    variance = np.diag(information) * 10.0 ** np.linspace(-1, 1, count)
-    none, some = [], []
-    for _ in range(500):
-        parts = rng.standard_normal((16, count)) * np.sqrt(variance / 16)
-        parts = (parts - parts.mean(0)) * math.sqrt(16 / 15)
-        score = rng.standard_normal(count) * np.sqrt(variance)
-        found = [(parts.T @ parts, 16)]
-        none.append(homogeneity.by_clutter(score, information, found))
-        some.append(homogeneity.by_clutter(score + 10 * np.sqrt(variance), information, found))
-    assert np.mean(np.array(none) < 0.05) < 0.05 + 0.03 and np.mean(np.array(none) < 0.01) < 0.01 + 0.014
-    assert np.mean(np.array(some) < 0.01) > 0.9
-
-
-def test_a_direction_that_scatters_does_not_hide_the_others():
-    """12 strengths, of which one combination scatters 128 times as much as noise between 16 parts, as the level of a
-    lamp that only two frames share did. The others are 15 sd from none each, which by the trace alone is significant
-    among 39 effects in half of the sets. Without an effect .01 is kept. 500 sets, to three sd."""
-    rng, count = np.random.default_rng(5), 12
-    turn = np.linalg.qr(rng.standard_normal((count, count)))[0]
-    sizes = np.sqrt(np.r_[128.0, np.ones(count - 1)])
-    none, some = [], []
-    for _ in range(500):
-        parts = rng.standard_normal((16, count)) * sizes / 4
-        parts = (parts - parts.mean(0)) * math.sqrt(16 / 15)
-        score, found = rng.standard_normal(count) * sizes, [(turn @ parts.T @ parts @ turn.T, 16)]
-        none.append(homogeneity.by_clutter(turn @ score, np.eye(count), found))
-        some.append(homogeneity.by_clutter(turn @ (score + np.r_[0.0, 15 * np.ones(count - 1)]), np.eye(count), found))
-    assert np.mean(np.array(none) < 0.01) < 0.01 + 0.014
-    assert np.mean(np.array(some) < 0.01 / 39) > 0.95
-
-
-def test_a_combination_that_nothing_tells_is_no_clutter():
-    """Gains of 12 frames beside a light that all frames share: their sum is left in V as rounding, 1e-7 of it, and
-    scatters by the same rounding, 1e4 times as much as V says. That says nothing of the others, which are 100 sd."""
-    rng, count = np.random.default_rng(3), 12
-    common = np.full((count, count), 1 / count)
-    others = np.eye(count) - common
-    parts = rng.standard_normal((16, count)) @ others
-    score = 100 * rng.standard_normal(count) @ others
-    assert homogeneity.by_clutter(score, others + 1e-7 * common, [(parts.T @ parts / 16 + 1e-3 * common, 16)]) < 1e-9
-
-
-def test_a_fit_that_stopped_short_is_no_clutter():
-    """An effect of which one of 16 parts knows 99 %: two sd short of its optimum, or on it, its scatter is the same."""
-    rng = np.random.default_rng(4)
-    part = np.repeat(np.arange(16.0), 50)
-    image = np.where(part == 4, 1.0, 0.026)[:, None] * (1 + 0.1 * rng.standard_normal((800, 1)))
-    left = rng.standard_normal(800)
-    short = left + 2 * image[:, 0] / math.sqrt(np.sum(image**2))
-    (b, parts), (same, _) = (homogeneity.variances([image], [r], [{"place": part}])[0] for r in (left, short))
-    np.testing.assert_allclose(same, b, rtol=1e-9)
-    assert parts == 16
 
 
 @pytest.mark.slow
