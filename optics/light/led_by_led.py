@@ -11,6 +11,7 @@ import drjit as dr
 import mitsuba as mi
 
 from optics.light.grazing import density, drawn
+from optics.light.windows import seen_through
 
 # share of the coordinates' size (mm) that a ray is moved along its direction beyond a flat interface, so that it does
 # not meet it again; float32 resolves 1e-7
@@ -23,7 +24,10 @@ def is_interface(shape) -> bool:
 
 
 class LedByLed:
-    """Methods of the integrator that follow the light of one LED at a time."""
+    """Methods of the integrator that follow the light of one LED at a time.
+
+    fronts   of a crowded scene (`optics.scene.crowd.Traced`), whose flat interfaces stand in a scene of their own, and
+             bend the light of LEDs; None elsewhere, where it passes them straight"""
 
     def hits(self, scene, camera, u, v):
         """Where the camera's rays through the pixel positions (u, v) meet the membrane: (si, weight, origin)."""
@@ -50,6 +54,14 @@ class LedByLed:
         nearest = led.stands()[2] - led.reach()
         return sum(1 for s in scene.shapes() if is_interface(s) and s.bbox().max.z > nearest)
 
+    def appears(self, scene, p, led, point):
+        """(LED, point) as they appear from the points p, behind interfaces that bend light."""
+        if self.fronts is None or self.fronts.scene is not scene:
+            return led, point
+        nearest = led.stands()[2] - led.reach()
+        faces = [face for face in self.fronts.faces() if face.bbox().min.z > nearest]
+        return seen_through(p, led, point, faces) if faces else (led, point)
+
     def spots(self, led):
         """The points that stand for an LED, one after another, each for an equal share of its light; opaque, so that
         what is compiled for one serves all."""
@@ -62,7 +74,7 @@ class LedByLed:
         """Whether the straight line from the surface to a point of an LED meets nothing but windows (detached)."""
         with dr.suspend_grad():
             valid = si.is_valid()
-            ray = si.spawn_ray_to(point)
+            ray = si.spawn_ray_to(self.appears(scene, si.p, led, point)[1])
             for _ in range(self.windows(scene, led)):
                 hit = scene.ray_intersect(ray, valid)
                 flat = hit.is_valid() & mi.has_flag(hit.bsdf().flags(), mi.BSDFFlags.DeltaTransmission)
@@ -81,6 +93,7 @@ class LedByLed:
         """Radiance per band of the fluorescence at `si` that light of an LED excites which a second pigment reflects,
         for a direction that was drawn by its cosine: pi times the radiance is the irradiance."""
         total = mi.UnpolarizedSpectrum(0.0)
+        led, point = self.appears(scene, second.p, led, point)
         to_led = point - second.p
         distance = dr.norm(to_led)
         to_led /= distance
@@ -97,7 +110,7 @@ class LedByLed:
     def direct(self, scene, si, weight, origin, led, visibility, point=None):
         """Radiance per band that one LED sends to the camera by one reflection (S3, S5), and by the gel itself; as a
         point at its position, or at another."""
-        point = led.position() if point is None else point
+        led, point = self.appears(scene, si.p, led, led.position() if point is None else point)
         to_led = point - si.p
         distance = dr.norm(to_led)
         s = to_led / distance

@@ -103,8 +103,7 @@ class Crowd:
 class Traced:
     """The scene that images LED by LED trace: one with balls in place of crowds' meshes.
 
-    scene    Mitsuba's, of other shapes than crowds, and their balls; without flat interfaces, which light from LEDs
-             passes straight
+    scene    Mitsuba's, of other shapes than crowds, and their balls, without flat interfaces
     windows  these interfaces, which lie between the camera and all else
     """
 
@@ -119,6 +118,12 @@ class Traced:
         self.scene = _scene((*others, *(c.shape for c in self.crowds)))
         self.windows = [shape.bsdf() for shape in flat]
         self._front = _scene(flat)
+
+    def faces(self) -> list:
+        """The shapes of the interfaces that bend light, the camera's first; none while no index differs."""
+        if all(window.number("index") == 1 for window in self.windows):
+            return []
+        return sorted(self._front.shapes(), key=lambda shape: float(shape.bbox().min.z))
 
     def place(self) -> None:
         """Take up where all shapes are now."""

@@ -198,6 +198,7 @@ class Scene:
             return None
         if self._traced_crowds is None:
             self._traced_crowds = Traced(self._whole, self._crowds)
+            self.integrator.fronts = self._traced_crowds
         elif self._placed != [part.times for part in self._crowds]:
             self._traced_crowds.place()
         self._placed = [part.times for part in self._crowds]

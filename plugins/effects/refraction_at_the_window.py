@@ -5,7 +5,8 @@ Definition
     window.
 Fingerprint
     the image shrinks towards the optical axis, more so for what lies deeper; the corners darken by a few percent. In a
-    fit the camera's field of view and position absorb nearly all of it: only a dent's depth or oblique views tell.
+    fit the camera's field of view and position absorb nearly all of it: only a dent's depth or oblique views tell. Of
+    beads in a gel, the LEDs' light falls off otherwise with depth, too: behind the window they seem to stand elsewhere.
 Validity
     flat windows across the optical axis; the onset is not linear over the range of real indices, so the ranking takes a
     finite step.

@@ -10,7 +10,8 @@ the index never enters a sampling probability. Two of them make a window: air to
 Fingerprint
     the image shrinks towards the axis, more with depth; a small fall-off towards the corners.
 Validity
-    no reflection from the window; flat and parallel to itself. At index 1 the interface is not there.
+    no reflection from the window; flat and parallel to itself. At index 1 the interface is not there. The light of LEDs
+    passes it straight, but for images LED by LED of a gel full of beads: there it is bent (`optics.light.windows`).
 References
     Born & Wolf, Principles of Optics, 1.5.2 (Fresnel's formulae).
 """

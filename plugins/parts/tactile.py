@@ -79,6 +79,7 @@ def build():
             self.declare(props)
             self.gel_of = {}
             self.glowing_of = {}
+            self.fronts = None
 
         def wavelengths(self, size):
             """The bands as a ray's wavelengths; unused lanes repeat the last band."""
