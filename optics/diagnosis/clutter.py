@@ -76,7 +76,8 @@ def variances(images: Sequence[np.ndarray], left: Sequence[np.ndarray], places: 
 
     Source: Liang & Zeger (1986); Bell & McCaffrey, Bias reduction in standard errors for linear regression with
     multi-stage samples, Survey Methodology 28, 169 (2002)."""
-    found, k = [], images[0].shape[1]
+    found: list[Scatter] = []
+    k = images[0].shape[1]
     root = st.root(sum(x.T @ x for x in images))
     back = np.linalg.pinv(root)
     rest = root.T @ root @ sum(x.T @ r for x, r in zip(images, left))
