@@ -96,6 +96,11 @@ class Frame:
     made: dict[str, Any] = field(default_factory=dict)
 
 
+def group_of(frame: Frame) -> str:
+    """The name of a frame's group; of one that is in none, its own."""
+    return frame.group or frame.name
+
+
 @dataclass
 class Captures:
     """A capture set.

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from optics.captures.capture_set import group_of
 from optics.diagnosis import fingerprints as prints
 from optics.diagnosis import statistics as st
 from optics.diagnosis.clutter import Others, by_clutter, variances
@@ -411,7 +412,7 @@ def _parts(model: Model, evidence: Evidence, places: list[dict]) -> dict[str, tu
         of_frame("frame", names)
     of_frame("LED", [led_label(f.parameters) for f in frames])
     if not dealt:
-        of_frame("group", [f.group or f.name for f in frames])
+        of_frame("group", [group_of(f) for f in frames])
     for key, numbers in prints.settings(model, evidence).items():
         if len(set(numbers)) <= 8:
             of_frame(key, [f"{v:g}" for v in numbers])

@@ -15,6 +15,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from optics.captures.capture_set import group_of
 from optics.diagnosis import statistics as st
 from optics.diagnosis.evidence import Evidence
 from optics.diagnosis.result import Drift, Surface
@@ -171,7 +172,7 @@ def presses_of(model: Model, evidence: Evidence) -> list[list[int]]:
     """Which of the evidence's frames each press has."""
     presses: dict[str, list[int]] = {}
     for k, i in enumerate(evidence.frames):
-        presses.setdefault(model.frames[i].group or model.frames[i].name, []).append(k)
+        presses.setdefault(group_of(model.frames[i]), []).append(k)
     return list(presses.values())
 
 

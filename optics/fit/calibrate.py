@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 
+from optics.captures.capture_set import group_of
 from optics.errors import Underdetermined, UnknownKey
 from optics.fit import starts
 from optics.fit.descent import Descent, Normal, Rows, covariance_of, prior_terms, stacked, whiten
@@ -71,7 +72,7 @@ def variables_from(
         ]
     groups: dict[str, list[int]] = {}
     for index in range(len(model.frames)) if frames is None else frames:
-        groups.setdefault(_group(model, index), []).append(index)
+        groups.setdefault(group_of(model.frames[index]), []).append(index)
     for pattern in per_group:
         for key in matching(pattern):
             variables += [Variable(f"{key}[{g}]", (key,), model.parameters[key], tuple(ii)) for g, ii in groups.items()]
@@ -86,10 +87,6 @@ def variables_from(
     return variables
 
 
-def _group(model: Model, frame: int) -> str:
-    return model.frames[frame].group or model.frames[frame].name
-
-
 def for_frames(model: Model, variables: Sequence[Variable], frames: Sequence[int]) -> list[Variable]:
     """The per-frame variables of a fit, for other frames: one per group where the fit has one per group.
 
@@ -98,11 +95,11 @@ def for_frames(model: Model, variables: Sequence[Variable], frames: Sequence[int
     found = []
     for keys in dict.fromkeys(v.keys for v in variables if v.frames is not None):
         alike = [v for v in variables if v.keys == keys and v.frames is not None]
-        groups = [_group(model, _first(v)) for v in alike]
+        groups = [group_of(model.frames[_first(v)]) for v in alike]
         single = len(set(groups)) < len(groups)  # several values within one group: each frame has its own
         shared: dict[str, list[int]] = {}
         for f in frames:
-            shared.setdefault(model.frames[f].name if single else _group(model, f), []).append(f)
+            shared.setdefault(model.frames[f].name if single else group_of(model.frames[f]), []).append(f)
         found += [
             Variable(f"{keys[0]}[{name}]", keys, alike[0].parameter, tuple(own), _prior_in(model, alike, own[0]))
             for name, own in shared.items()

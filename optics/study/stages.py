@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from optics.captures.capture_set import group_of
 from optics.fit import calibrate
 from optics.fit.compare import Comparison, compare
 from optics.fit.model import value_of
@@ -215,7 +216,7 @@ def comparison_of(
         [model.usable(i) for i in range(len(model.frames))],
         [model.coordinates(values, i) for i in range(len(model.frames))],
         [f.parameters for f in model.frames],
-        [f.group or f.name for f in model.frames],
+        [group_of(f) for f in model.frames],
         names=[f.name for f in model.frames],
         full_scale=model.noise.saturation - model.noise.black_level,
         black_level=model.noise.black_level,
