@@ -20,6 +20,7 @@ LEVELS = 3  # of its pyramid: motions up to half a window times 2^3
 # Of DIS: px from patch to patch, steps of each, and smoothings at the end. Without these, motion that differs with
 # depth is found better, but noise between the beads costs maps that learnt from projections half of their place.
 STRIDE, DESCENTS, SMOOTHINGS = 4, 8, 3
+TINY = np.float32(1e-20)  # px: a motion that has no direction
 
 
 def _opencv():
@@ -171,14 +172,15 @@ def dense_features(field: np.ndarray, bins: int | tuple[int, int]) -> tuple[np.n
         size, angle, _ = dense_bins(field, bins)
         return bin_vectors(pixel_middles(field.shape[:2]), field.reshape(-1, 2), field.shape[:2], bins), size, angle
 
-    def means(values: np.ndarray) -> np.ndarray:
-        lines = np.add.reduceat(values, np.arange(0, height, height // rows), 0)
-        return np.add.reduceat(lines, np.arange(0, width, width // columns), 1) / (height // rows * (width // columns))
+    cv2 = _opencv()
 
-    x, y = (np.ascontiguousarray(field[..., k]) for k in (0, 1))
-    size = np.sqrt(x * x + y * y)
-    per = 1 / np.where(size > 0, size, 1)
-    angle = np.arctan2(means(y * per), means(np.where(size > 0, x * per, 1)))  # no motion has the angle 0
+    def means(values: np.ndarray) -> np.ndarray:
+        return cv2.resize(values, (columns, rows), interpolation=cv2.INTER_AREA).astype(float)
+
+    x, y = cv2.split(np.asarray(field, np.float32))
+    size = cv2.magnitude(x, y)
+    per = np.maximum(size, TINY)
+    angle = np.arctan2(means(y / per), means(x / per + (size == 0)))  # no motion has the angle 0
     return np.stack([means(x), means(y)], -1), means(size), angle
 
 
