@@ -34,7 +34,7 @@ HAIR = 0.01  # of the fall: a split that gains less says nothing about what the 
 class Added:
     """A fitted effect with the evidence at its values.
 
-    own         columns of the base, of what was added beside, of the effect, and of images the other candidates
+    own         columns of the base, of what was added beside and of the effect; of images, of other candidates too
     calibrated  those of the base and of what was added beside; effect, others: of the effect, of the others
     change      (k,) of its strengths from where they started
     images      per block, the whitened difference (n,) that the effect makes; again: the same of other samples, where

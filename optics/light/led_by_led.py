@@ -49,17 +49,16 @@ class LedByLed:
             si = dr.select(flat, through, si)
         return si, weight, dr.select(si.is_valid(), si.p + si.to_world(si.wi) * si.t, o)
 
-    def windows(self, scene, led):
-        """How many flat interfaces stand between an LED and the skin."""
+    def between(self, shapes, led):
+        """The flat interfaces among some shapes that stand between an LED and the skin."""
         nearest = led.stands()[2] - led.reach()
-        return sum(1 for s in scene.shapes() if is_interface(s) and s.bbox().max.z > nearest)
+        return [s for s in shapes if is_interface(s) and s.bbox().max.z > nearest]
 
     def appears(self, scene, p, led, point):
         """(LED, point) as they appear from the points p, behind interfaces that bend light."""
         if self.fronts is None or self.fronts.scene is not scene:
             return led, point
-        nearest = led.stands()[2] - led.reach()
-        faces = [face for face in self.fronts.faces() if face.bbox().min.z > nearest]
+        faces = self.between(self.fronts.faces(), led)
         return seen_through(p, led, point, faces) if faces else (led, point)
 
     def spots(self, led):
@@ -75,7 +74,7 @@ class LedByLed:
         with dr.suspend_grad():
             valid = si.is_valid()
             ray = si.spawn_ray_to(self.appears(scene, si.p, led, point)[1])
-            for _ in range(self.windows(scene, led)):
+            for _ in self.between(scene.shapes(), led):
                 hit = scene.ray_intersect(ray, valid)
                 flat = hit.is_valid() & mi.has_flag(hit.bsdf().flags(), mi.BSDFFlags.DeltaTransmission)
                 ray = dr.select(flat, hit.spawn_ray_to(point), ray)
