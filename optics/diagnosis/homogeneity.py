@@ -115,7 +115,8 @@ def split(
     told = added if table else whole
     if c.effect.scope == "frame":  # frames do not scatter about strengths that each has for itself
         places = [{name: values for name, values in p.items() if name != "frame"} for p in places]
-    chance, clutter, errors = scatter(told.own, told.calibrated, told.effect, told.change, places, net, told.others)
+    others = told.others if added is told else ()
+    chance, clutter, errors = scatter(told.own, told.calibrated, told.effect, told.change, places, net, others)
     if added is not told:  # errors are those of a fit without a lamp; whether it is there is asked beside that lamp
         change = _at_optimum(added)
         chance, *_ = scatter(added.own, added.calibrated, added.effect, change, places, over_noise, added.others)
@@ -356,7 +357,8 @@ def scatter(
     clutter    (k, k) V^-1 (B - V) V^-1, with B of `variances`, of the map in which it is larger; zero for too few parts
     noise      (k, k) V^-1 at the values that were found
     """
-    projected, clutter = own.project(own.thinned(), calibrated, effect, own.thinning), np.zeros((len(effect),) * 2)
+    normal, clutter = own.thinned(), np.zeros((len(effect),) * 2)
+    projected = own.project(normal, calibrated, effect, own.thinning)
     white = st.root(projected.information, st.VISIBLE)
     covariance = white.T @ white
     images = _off_base(own, [block.columns(effect) for block in own.blocks], projected, calibrated)
@@ -375,7 +377,7 @@ def scatter(
         score = score * math.sqrt(fall / square)
     if others:
         base = [*calibrated, *effect]
-        rest = own.project(own.thinned(), base, others, own.thinning)
+        rest = own.project(normal, base, others, own.thinning)
         beside = _off_base(own, [block.columns(others) for block in own.blocks], rest, base)
         found = Others(beside, left, places).join(images, found)
     return by_clutter(score, projected.information, found), clutter, covariance
