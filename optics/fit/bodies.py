@@ -32,6 +32,8 @@ ALONG = 0.02  # of the distance, along the line of sight: a fiftieth of the outl
 MARGIN = 2.0  # px beyond an outline that a bead still changes
 WORTH = 0.02  # fall of what is minimised per variable that is not worth another step
 DAMPING = 1e-3
+ROUGH = 0.01  # of the light, by which a prediction may be off while bodies are missing
+LOOSE = 2.0  # such errors, from which on a pixel counts less: as 1/(1 + (r/2)^2)^2, after Geman and McClure
 CHORDS, MOST_POOR = 10, 4  # steps on the same derivatives, and those without a gain that are tried
 GOOD = 0.7  # of the fall that was promised: with less, derivatives no longer hold, and other steps may lead astray
 PART = 0.05  # of what the steps on these derivatives gained: a step that gains less is better followed by new ones
@@ -70,21 +72,50 @@ def refine(
     frames: Sequence[int] | None = None,
     *,
     depth_prior: tuple[float, float] | None = None,
+    missing: bool = False,
     max_iterations: int = 12,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Bodies:
     """Fit the places of the crowd `name`, from where they are, and the variables to frames of a model.
 
     depth_prior   mean and standard deviation of -z, mm, that hold for every bead before it is seen
+    missing       bodies may be missing, or be where none are: a pixel that is far off counts little, each body goes its
+                  own way, and its errors grow with what is left around it
 
     Leaves the scene with the places that were found. Raises BadScene where the part has no places to fit."""
     part: Any = model.scene.parts.get(name)
     if part is None or not hasattr(part, "put"):
         raise BadScene(f"'{name}' is no part with places to fit; allowed: a part of the kind 'beads'")
-    problem = _Problem(model, part, list(variables), list(range(len(model.frames)) if frames is None else frames))
+    frames = list(range(len(model.frames)) if frames is None else frames)
+    problem = _Problem(model, part, list(variables), frames, ROUGH if missing else 0.0)
     problem.prior = depth_prior
     values = with_start(model, problem.variables, start or Values())
     points = part.rest() - part.sunk()
+    if missing:
+        points, values, state = problem.settle(points, values, max_iterations, progress)
+        history: list[float] = []
+    else:
+        points, values, state, history = _descent(problem, points, values, max_iterations, progress)
+    equations = problem.linearise(points, values, state)
+    history.append(equations.total)
+    covariances, sd = equations.errors()
+    chi2 = equations.chi2
+    if missing:
+        chi2, near = problem.misfit(points, values, state)
+        covariances = covariances * np.maximum(near, 1.0)[:, None, None]
+    model.scene.put(name, points, part.measured)
+    errors = np.sqrt(np.einsum("nii->ni", covariances))
+    return Bodies(points, errors, covariances, problem.variables, values, sd, chi2, equations.dof, history)
+
+
+def _descent(
+    problem: _Problem,
+    points: np.ndarray,
+    values: Values,
+    max_iterations: int,
+    progress: Callable[[str, int, int], None] | None,
+) -> tuple[np.ndarray, Values, State, list[float]]:
+    """Levenberg and Marquardt's steps of all together; places, values, the state there, and what was minimised."""
     damping, history = DAMPING, []
     state = problem.residual(points, values)
     for iteration in range(max_iterations):
@@ -111,21 +142,18 @@ def refine(
                     break
         if gained < WORTH * (points.size + len(problem.variables)):
             break
-    equations = problem.linearise(points, values, state)
-    history.append(equations.total)
-    covariances, sd = equations.errors()
-    model.scene.put(name, points, part.measured)
-    errors = np.sqrt(np.einsum("nii->ni", covariances))
-    return Bodies(points, errors, covariances, problem.variables, values, sd, equations.chi2, equations.dof, history)
+    return points, values, state, history
 
 
 class _Problem:
-    """The frames of a model as a function of the places of bodies and of a few parameters."""
+    """The frames of a model as a function of the places of bodies and of a few parameters.
+
+    rough   share of the light that a prediction may miss, while bodies are missing; 0: none is"""
 
     prior: tuple[float, float] | None = None
 
-    def __init__(self, model: SceneModel, part: Any, variables: list[Variable], frames: list[int]):
-        self.model, self.part, self.variables, self.frames = model, part, variables, frames
+    def __init__(self, model: SceneModel, part: Any, variables: list[Variable], frames: list[int], rough: float = 0.0):
+        self.model, self.part, self.variables, self.frames, self.rough = model, part, variables, frames, rough
         self.pixels = [(f, model.usable(f)) for f in frames]
 
     def place(self, points: np.ndarray) -> None:
@@ -139,6 +167,58 @@ class _Problem:
         """Predictions, and the residuals of all frames."""
         found = self.predict(points, values)
         return found, [self.model.frames[f].image - p for f, p in zip(self.frames, found)]
+
+    def weights(self, values: Values, predictions: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """1/sd of all values of the frames; 0 where a pixel is not used. While bodies are missing (`rough`), what is
+        far off counts little: light may come from one that is missing, and would blow up its neighbours."""
+        found = []
+        for (frame, used), p in zip(self.pixels, predictions):
+            image, variance = self.model.frames[frame].image, self.model.variance(values, frame, p)
+            if self.rough:
+                variance = variance + (self.rough * (np.maximum(image, p) - self.model.noise.black_level)) ** 2
+                variance = variance * (1 + (image - p) ** 2 / (LOOSE**2 * variance)) ** 2
+            found.append(np.sqrt(used / variance))
+        return found
+
+    def around(self, state: State) -> np.ndarray:
+        """(N,) chi2 of the pixels of each body, at the present weights."""
+        squares = [((r * s) ** 2).sum(-1).ravel() for r, s in zip(state[1], self.scales)]
+        return np.sum([[one[own].sum() for own in of] for one, of in zip(squares, self.own)], 0)
+
+    def misfit(self, points: np.ndarray, values: Values, state: State) -> tuple[float, np.ndarray]:
+        """chi2 by the noise alone, and (N,) chi2 over the number of values of each body's pixels."""
+        rough, self.rough = self.rough, 0.0
+        try:
+            self.look(points, values)
+            self.scales = self.weights(values, state[0])
+        finally:
+            self.rough = rough
+        count = np.sum([[len(own) for own in of] for of in self.own], 0) * self.model.shape[2]
+        chi2 = sum(float(((r * s) ** 2).sum()) for r, s in zip(state[1], self.scales))
+        return chi2, self.around(state) / np.maximum(count, 1)
+
+    def settle(
+        self,
+        points: np.ndarray,
+        values: Values,
+        steps: int,
+        progress: Callable[[str, int, int], None] | None = None,
+    ) -> tuple[np.ndarray, Values, State]:
+        """Places and values after some steps, and the state there. A body keeps its step where the residual around it
+        falls, so that one that goes astray holds up no other."""
+        damping = np.full(len(points), DAMPING)
+        state = self.residual(points, values)
+        for step in range(steps):
+            if progress:
+                progress("places", step, steps)
+            equations = self.linearise(points, values, state)
+            x, z, _ = equations.step(damping)
+            moved, now = self.moved(points, x), self.put(values, z)
+            good = self.around(self.residual(moved, now)) < self.around(state)
+            points, values = np.where(good[:, None], moved, points), now
+            damping = np.where(good, np.maximum(damping / 4, 1e-6), damping * 6)
+            state = self.residual(points, values)
+        return points, values, state
 
     def put(self, values: Values, z: np.ndarray) -> Values:
         values = values.copy()
@@ -218,10 +298,10 @@ class _Problem:
     def linearise(self, points: np.ndarray, values: Values, state: State) -> _Equations:
         from scipy.sparse import coo_matrix
 
-        model, channels = self.model, self.model.shape[2]
+        channels = self.model.shape[2]
         self.look(points, values)
         predictions, residuals = state
-        self.scales = [np.sqrt(u / model.variance(values, f, p)) for (f, u), p in zip(self.pixels, predictions)]
+        self.scales = self.weights(values, predictions)
         size = residuals[0].size
         rows, columns, entries = [], [], []
         for colour in self.colours:
@@ -239,10 +319,15 @@ class _Problem:
         shape = (size * len(self.frames), points.size)
         j = coo_matrix((np.concatenate(entries), (np.concatenate(rows), np.concatenate(columns))), shape).tocsr()
         self.place(points)
-        dense = np.zeros((shape[0], len(self.variables)))
+        return self.equations(j, residuals, points, values)
+
+    def equations(self, j: Any, residuals: list[np.ndarray], points: np.ndarray, values: Values) -> _Equations:
+        """Normal equations of the places' weighed derivatives `j` and of the variables'."""
+        size = residuals[0].size
+        dense = np.zeros((j.shape[0], len(self.variables)))
         if self.variables:
             index = {v.name: i for i, v in enumerate(self.variables)}
-            for f, (_, images) in enumerate(model.derivatives(values, self.variables, self.frames)):
+            for f, (_, images) in enumerate(self.model.derivatives(values, self.variables, self.frames)):
                 for name, image in images.items():
                     dense[f * size : (f + 1) * size, index[name]] = (image * self.scales[f]).ravel()
         r = np.concatenate([(res * s).ravel() for res, s in zip(residuals, self.scales)])
@@ -278,18 +363,20 @@ class _Equations:
             mean, sd = problem.prior
             self.ra = self.ra - (self.slope * ((-points[:, 2] - mean) / sd)[:, None]).ravel()
 
-    def _eliminated(self, damping: float) -> tuple[Any, np.ndarray, np.ndarray]:
-        """A factorised, A^-1 B, and the Schur complement C - B'A^-1 B."""
+    def _eliminated(self, damping: float | np.ndarray) -> tuple[Any, np.ndarray, np.ndarray]:
+        """A factorised, A^-1 B, and the Schur complement C - B'A^-1 B; of each body its own damping, or one."""
         from scipy.sparse import diags
         from scipy.sparse.linalg import splu
 
         diagonal = self.a.diagonal()
-        lift = damping * diagonal + 1e-12 * max(diagonal.max(), 1e-300)  # of bodies that nothing shows
+        lift = np.repeat(damping, 3 if np.ndim(damping) else diagonal.size) * diagonal + 1e-12 * max(
+            diagonal.max(), 1e-300
+        )  # of bodies that nothing shows
         factor = splu((self.a + diags(lift)).tocsc())
         inner = factor.solve(self.b) if self.b.shape[1] else self.b
-        return factor, inner, self.c + damping * np.diag(np.diag(self.c)) - self.b.T @ inner
+        return factor, inner, self.c + np.min(damping) * np.diag(np.diag(self.c)) - self.b.T @ inner
 
-    def step(self, damping: float) -> tuple[np.ndarray, np.ndarray, float]:
+    def step(self, damping: float | np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
         """(3 N,) in half widths of the differences along each line of sight, (p,) of the parameters, and the fall that
         they promise."""
         factor, inner, schur = self._eliminated(damping)

@@ -3,11 +3,10 @@
     found = locate(Setup(captures="session"), "beads.csv")
     optics calibrate session -D places=beads.csv ...
 
-In the image at rest each bead is found as a bright disc (`optics.readers.flow.find_beads`), on the line of sight
-through its middle and in the middle of the layer that has beads. `optics.fit.bodies` fits all places in all frames:
-a bead's size, its brightness and its motion under presses tell its depth. Where the residual shows a bead that was
-not found, hidden behind another or merged with it, it is added, and all are fitted once more. A scene takes part
-whose beads have `<string name="places" value="$places"/>`."""
+In the images at rest beads are found one behind the other (`optics.fit.sought`), however many overlap. Then
+`optics.fit.bodies` fits all places in all frames: a bead's size, its brightness, its shadows and its motion under
+presses tell its depth. In what is left beads are sought once more, and all are fitted again. A scene takes part whose
+beads have `<string name="places" value="$places"/>`."""
 
 from __future__ import annotations
 
@@ -25,15 +24,13 @@ from optics.files.output import write_text
 from optics.fit.bodies import Bodies, refine
 from optics.fit.calibrate import variables_from
 from optics.fit.scene_model import SceneModel
-from optics.readers.flow import find_beads
-from optics.scene.parameter import Values
+from optics.fit.sought import Seeker
+from optics.scene.parameter import Values, Variable
 from optics.skin.cloud import write_places
 from optics.study.setup import Setup, open_model
 
 AMISS = 1.5  # chi2 over its degrees of freedom, above which places are not to be believed
-ROUNDS = 3  # fits, between which beads are added
-SEEN = 6.0  # standard deviations by which a disc as large as a bead must stand out of the residual
-BRIGHT = 0.3  # of the median bead's light, which it must have
+ROUNDS = 2  # fits, before each of which beads are sought
 
 
 @dataclass
@@ -106,21 +103,38 @@ def _located(
     setup: Setup, file: Path, free: Sequence[str], progress: Callable[[str, int, int], None] | None
 ) -> Located:
     setup = replace(setup, defines={**setup.defines, "places": os.path.abspath(file)})
-    write_places(file, np.array([[0.0, 0.0, -1.0]]))  # until the image at rest is read
-    model = open_model(setup)
-    name = _crowd(model)
-    points = start_places(model, name)
-    found = len(points)
-    depths = depth_prior(model, name)
-    for round_ in range(ROUNDS):
+
+    def reopen(points: np.ndarray) -> SceneModel:
         write_places(file, points)
-        model = open_model(setup)
-        variables = variables_from(model, list(free) or sorted(model.scene.powers.values()))
-        fit = refine(model, name, variables, Values(dict(setup.values)), depth_prior=depths, progress=progress)
-        more = missed(model, name, fit) if round_ < ROUNDS - 1 else np.zeros((0, 3))
-        if not len(more):
+        return open_model(setup)
+
+    def solved_for(model: SceneModel) -> list[Variable]:
+        return variables_from(model, list(free) or sorted(model.scene.powers.values()))
+
+    model = reopen(np.array([[0.0, 0.0, -1.0]]))  # until the images at rest are read
+    name = _crowd(model)
+    part = model.scene.parts[name]
+    depths = part.number("top"), part.number("bottom")
+    prior = sum(depths) / 2, (depths[1] - depths[0]) / np.sqrt(12)  # of equal chances between both
+    seeker = Seeker(reopen, name, at_rest(model), depths, solved_for, Values(dict(setup.values)), progress)
+    points, values = seeker.seek()
+    if not len(points):
+        raise ValueError(
+            f"{model.captures.folder}: no bead is seen in the frames at rest; allowed: a frame without a press, in "
+            f"which beads of {seeker.diameter:g} mm (beads.diameter) are 4 px wide or more and brighter than what is "
+            "around them"
+        )
+    found = len(points)
+    for round_ in range(ROUNDS):
+        model = reopen(points)
+        fit = refine(
+            model, name, solved_for(model), values, depth_prior=prior, missing=True, max_iterations=6, progress=progress
+        )
+        points, values = seeker.seek(fit.points, fit.values) if round_ < ROUNDS - 1 else (fit.points, fit.values)
+        if np.array_equal(points, fit.points):
             break
-        points = np.concatenate([fit.points, more])
+    if fit.chi2 < AMISS * fit.dof:  # none is missing: all pixels count by their noise
+        fit = refine(model, name, solved_for(model), values, depth_prior=prior, progress=progress)
     write_places(file, fit.points)
     located = Located(file, fit, found, len(fit.points) - found)
     write_text(file.with_suffix(".json"), json.dumps(located.record(), indent=1))
@@ -139,73 +153,12 @@ def _crowd(model: SceneModel) -> str:
     return found[0]
 
 
-def depth_prior(model: SceneModel, name: str) -> tuple[float, float]:
-    """Mean and standard deviation of the depths between `top` and `bottom`, mm."""
-    top, bottom = (model.scene.parts[name].number(n) for n in ("top", "bottom"))
-    return (top + bottom) / 2, (bottom - top) / np.sqrt(12)
-
-
 def at_rest(model: SceneModel) -> list[int]:
-    """The frames whose skin is pressed least."""
+    """The frames whose skin is pressed least; of those that were made alike, the first."""
     gel = model.scene.gel
     key = None if gel is None else model.scene.key(gel.name, "press depth")
     depths = [0.0 if key is None else float(f.parameters.get(key, model.base[key])) for f in model.frames]
-    return [i for i, depth in enumerate(depths) if depth == min(depths)]
-
-
-def start_places(model: SceneModel, name: str) -> np.ndarray:
-    """(N, 3) mm: beads of the image at rest, in the middle of the layer that has them."""
-    image = np.sum([model.frames[i].image.astype(float) - model.noise.black_level for i in at_rest(model)], 0)
-    light = image[..., int(np.argmax(image.mean((0, 1))))]
-    places = find_beads(np.clip(light, 0, None), saturation=max(float(light.max()), 1.0))
-    if not len(places):
-        raise ValueError(
-            f"{model.captures.folder}: no bead is seen in the frames at rest; allowed: a frame without a press, in "
-            "which beads are 4 px wide or more and brighter than what is around them"
-        )
-    return _at_depth(model, places, depth_prior(model, name)[0])
-
-
-def _at_depth(model: SceneModel, places: np.ndarray, depth: float) -> np.ndarray:
-    """(N, 3) where the lines of sight through (N, 2) px are so deep below the face."""
-    import mitsuba as mi
-
-    if not len(places):
-        return np.zeros((0, 3))
-    o, d = (np.array(a, float).T for a in model.scene.camera.ray(*(mi.Float(a.astype("f")) for a in places.T)))
-    return o + d * ((-depth - o[:, 2]) / d[:, 2])[:, None]
-
-
-def missed(model: SceneModel, name: str, fit: Bodies) -> np.ndarray:
-    """(N, 3) starts of beads that the residual at rest shows: discs of light as large as a bead, brighter than
-    predicted by SEEN standard deviations and by BRIGHT of a bead."""
-    from scipy.ndimage import gaussian_filter, maximum_filter
-
-    frames = at_rest(model)
-    predicted = model.predict(fit.values, frames)
-    camera: Any = model.scene.camera
-    part: Any = model.scene.parts[name]
-    middles, radii = part.balls()
-    wide = float(np.median(np.linalg.norm(camera.project(middles + [1e-2, 0, 0]) - camera.project(middles), axis=1)))
-    sd = max(0.5 * wide * 100 * float(np.median(radii)), 0.7)  # px
-    left: np.ndarray | float = 0.0
-    power: np.ndarray | float = 0.0
-    light: np.ndarray | float = 0.0
-    for i, p in zip(frames, predicted):
-        left = left + (model.frames[i].image - p).sum(-1)
-        power = power + model.variance(fit.values, i, p).sum(-1)
-        light = light + (p - model.noise.black_level).sum(-1)
-    smooth = gaussian_filter(np.asarray(left), sd)
-    noise = np.sqrt(gaussian_filter(np.asarray(power), sd) / (4 * np.pi * sd**2))
-    bead = float(np.median(gaussian_filter(np.asarray(light), sd)[_within(model, camera.project(middles))]))
-    peak = (smooth == maximum_filter(smooth, 2 * int(np.ceil(2 * sd)) + 1)) & (smooth > SEEN * noise)
-    v, u = np.nonzero(peak & (smooth > BRIGHT * bead))
-    return _at_depth(model, np.column_stack([u, v]) + 0.5, depth_prior(model, name)[0])
-
-
-def _within(model: SceneModel, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and columns of the pixels that hold places in px."""
-    height, width = model.shape[:2]
-    column, row = np.floor(places).astype(int).T
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    return row[inside], column[inside]
+    least = [i for i, depth in enumerate(depths) if depth == min(depths)]
+    powers = model.scene.powers.values()
+    lights = {i: tuple(str(model.frames[i].parameters.get(p)) for p in powers) for i in least}
+    return [i for i in least if next(k for k in least if lights[k] == lights[i]) == i]

@@ -130,3 +130,69 @@ def test_places_and_parameters_come_back_with_their_errors(mitsuba, tmp_path):
     for variable, sd in zip(variables, fit.sd):
         assert abs(fit.values.common[variable.name] - built[variable.name]) < 4 * sd, variable.name
     assert np.median(fit.errors[:, 2]) < 0.03 and np.median(fit.errors[:, :2]) < 0.005  # mm
+
+
+@pytest.mark.slow
+def test_beads_are_found_without_a_start(mitsuba, tmp_path, monkeypatch):
+    """The same fourteen, of which nothing is known but the layer that holds them: all are found, and no other."""
+    from optics.fit.scene_model import SceneModel
+    from optics.proof.makers.particle import CAMERA, ParticleMaker
+    from optics.proof.rigs.particle import ParticleGel
+    from optics.scene import loader
+    from optics.study import located
+    from optics.study.setup import Setup
+
+    rig = ParticleGel()
+    rig.defines = {**rig.defines, "beads": "14", "fine": "4"}
+    scene = rig.scene()
+    built = rig.built(scene, 0)
+    maker = ParticleMaker(scene, built, {}, CAMERA, 5)
+    captures = maker.captures([(0.0, 0.0, 0.0), (2.0, -1.5, 0.6)])
+    captures.parameters.update({k: built[k] for k in ("camera.x_fov", "dye.yield")})
+
+    def opened(setup):
+        return SceneModel(
+            loader.load("particle_gel", {**rig.defines, "places": setup.defines["places"]}), captures, CAMERA
+        )
+
+    monkeypatch.setattr(located, "open_model", opened)
+    found = located.locate(Setup(captures="session"), tmp_path / "beads.csv")
+    truth, fit = maker.rest(), found.fit
+    apart = np.linalg.norm(fit.points[:, None] - truth[None], axis=-1)
+    nearest = apart.argmin(1)
+    assert sorted(nearest) == list(range(14))
+    assert apart.min(1).max() < 0.1  # mm, of beads of 1.2
+    pulls = (fit.points - truth[nearest]) / fit.errors
+    assert np.all(np.abs(np.sqrt((pulls**2).mean(0)) - 1) < 0.6), pulls  # 14 numbers each: 1 +- 0.19
+    assert fit.chi2 / fit.dof < 1.05
+    np.testing.assert_allclose(read_places(tmp_path / "beads.csv")[0], fit.points, atol=1e-6)
+
+
+@pytest.mark.slow
+def test_beads_that_overlap_are_found_one_behind_the_other(mitsuba, tmp_path):
+    """64 beads as dense as the shipped scene's, which cover 0.8 of the image, by the numpy maker."""
+    from optics.fit.calibrate import variables_from
+    from optics.fit.scene_model import SceneModel
+    from optics.fit.sought import Seeker
+    from optics.proof.makers.particle import CAMERA, ParticleMaker
+    from optics.scene import loader
+
+    size = {"width": "76", "height": "76", "x_fov": "17", "beads": "64", "field": "4.4", "fine": "2", "seed": "7"}
+    scene = loader.load("particle_gel", size)
+    powers = {f"{name}.power": scene.values()[f"{name}.power"] * k for name, k in zip(scene.leds, (1.05, 0.93))}
+    maker = ParticleMaker(scene, {**powers, "cover.sigma": 0.0}, {}, CAMERA, 1007, 6)
+    captures = maker.captures([(0.0, 0.0, 0.0)])
+
+    def reopen(points):
+        write_places(tmp_path / "beads.csv", points)
+        return SceneModel(
+            loader.load("particle_gel", {**size, "places": str(tmp_path / "beads.csv")}), captures, CAMERA
+        )
+
+    seeker = Seeker(reopen, "beads", [0, 1], (0.4, 4.1), lambda m: variables_from(m, ["*_ring.power"]), Values())
+    points, values = seeker.seek()
+    apart = np.linalg.norm(points[:, None] - maker.rest()[None], axis=-1)
+    assert (apart.min(0) < 0.1).sum() >= 32
+    assert (apart.min(1) > 0.3).sum() <= 0.2 * len(points)
+    for name, true in powers.items():
+        assert values.common[name] == pytest.approx(true, rel=0.02)
