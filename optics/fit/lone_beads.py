@@ -37,6 +37,11 @@ def outline(model: SceneModel, middles: np.ndarray, radii: np.ndarray) -> float:
     return float(np.nanmax(wide, initial=1.0))
 
 
+def size(part: Any) -> float:
+    """mm: the diameter of a crowd's balls in the median."""
+    return 2 * float(np.median(part.balls()[1]))
+
+
 def scattered(model: SceneModel, depths: tuple[float, float], diameter: float, seed: int) -> np.ndarray:
     """(N, 3) mm: places on a shifted grid in the image, APART diameters from each other, at random depths."""
     height, width = model.shape[:2]
@@ -60,7 +65,7 @@ def glow(
     black = model.noise.black_level
     places, normals, lights, images = [], [], [], []
     for draw in range(DRAWS):
-        model.scene.put(name, scattered(model, depths, part.number("diameter"), draw), part.measured)
+        model.scene.put(name, scattered(model, depths, size(part), draw), part.measured)
         image = model.predict(values, [frame])[0] - black
         middles, radii = part.balls()
         at = model.scene.camera.project(middles)

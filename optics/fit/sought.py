@@ -19,7 +19,7 @@ import numpy as np
 
 from optics.fit.bodies import ROUGH, State, _Equations, _Problem
 from optics.fit.calibrate import with_start
-from optics.fit.lone_beads import at_depth, glow, outline, rays, scattered
+from optics.fit.lone_beads import at_depth, glow, outline, rays, scattered, size
 from optics.fit.model import value_of
 from optics.fit.painted import DIMMEST, SIDE, Box, Canvas, Glow, Layers, between, dims, layers, of_normal, shaded, shine
 from optics.fit.scene_model import SceneModel
@@ -207,7 +207,7 @@ class Seeker:
         self.reopen, self.name, self.depths = reopen, name, depths
         self.variables, self.progress = variables, progress
         model = reopen(np.array([[0.0, 0.0, -sum(depths) / 2]]))
-        self.diameter = float(model.scene.parts[name].number("diameter"))
+        self.diameter = size(model.scene.parts[name])
         self.model = model = reopen(scattered(model, depths, self.diameter, 0))
         self.values = with_start(model, variables(model), values)
         fine, self.centre = (Canvas(lambda u, v: rays(model, u, v), model.shape[:2], side) for side in (SIDE, 1))
@@ -365,8 +365,8 @@ class Seeker:
         if not len(at):
             return at
         shade = [between(at, found.points, view.spots, self.diameter) for view in self.views]
-        for size in FINER:
-            at = self._closer(at, found, strict, shade, size)
+        for step in FINER:
+            at = self._closer(at, found, strict, shade, step)
         score = self.weigh(at, found, strict, shade)
         good = (score > SEEN) & free(at)
         return at[good][self._apart(at[good], score[good], 2.0)]

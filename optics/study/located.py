@@ -113,8 +113,8 @@ def _located(
 
     model = reopen(np.array([[0.0, 0.0, -1.0]]))  # until the images at rest are read
     name = _crowd(model)
-    part = model.scene.parts[name]
-    depths = part.number("top"), part.number("bottom")
+    layer: Any = model.scene.parts[name]
+    depths = layer.layer()
     prior = sum(depths) / 2, (depths[1] - depths[0]) / np.sqrt(12)  # of equal chances between both
     seeker = Seeker(reopen, name, at_rest(model), depths, solved_for, Values(dict(setup.values)), progress)
     points, values = seeker.seek()
@@ -142,7 +142,9 @@ def _located(
 
 
 def _crowd(model: SceneModel) -> str:
-    parts: dict[str, Any] = {n: part for n, part in model.scene.parts.items() if hasattr(part, "put")}
+    parts: dict[str, Any] = {
+        n: part for n, part in model.scene.parts.items() if hasattr(part, "put") and hasattr(part, "layer")
+    }
     found = list(parts)
     if len(found) != 1 or len(parts[found[0]].balls()[1]) != 1:
         raise BadScene(

@@ -139,6 +139,10 @@ def build():
             n = self.number
             return n("width") - n("diameter"), n("length") - n("diameter"), n("bottom") - n("top")
 
+        def layer(self):
+            """Depths of the highest and of the lowest middle below the face, mm."""
+            return self.number("top"), self.number("bottom")
+
         def takes(self, name):
             if name in ("spread", "diameter") and self.measured is not None:
                 return False
