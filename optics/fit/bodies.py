@@ -214,10 +214,11 @@ class _Problem:
             equations = self.linearise(points, values, state)
             x, z, _ = equations.step(damping)
             moved, now = self.moved(points, x), self.put(values, z)
-            good = self.around(self.residual(moved, now)) < self.around(state)
+            trial = self.residual(moved, now)
+            good = self.around(trial) < self.around(state)
             points, values = np.where(good[:, None], moved, points), now
             damping = np.where(good, np.maximum(damping / 4, 1e-6), damping * 6)
-            state = self.residual(points, values)
+            state = trial if good.all() else self.residual(points, values)
         return points, values, state
 
     def put(self, values: Values, z: np.ndarray) -> Values:
@@ -273,7 +274,6 @@ class _Problem:
                 inside = (x[box] - u) ** 2 + (y[box] - v) ** 2 < r**2
                 rows, columns = np.nonzero(inside)
                 self.own[-1].append((rows + top) * width + columns + low)
-        self.colours = self._coloured()
 
     def _coloured(self) -> list[np.ndarray]:
         """Numbers of bodies, colour by colour: no two of a colour come near each other in any frame."""
@@ -296,15 +296,13 @@ class _Problem:
         return [np.flatnonzero(colour == c) for c in range(colour.max() + 1)]
 
     def linearise(self, points: np.ndarray, values: Values, state: State) -> _Equations:
-        from scipy.sparse import coo_matrix
-
         channels = self.model.shape[2]
         self.look(points, values)
         predictions, residuals = state
         self.scales = self.weights(values, predictions)
         size = residuals[0].size
         rows, columns, entries = [], [], []
-        for colour in self.colours:
+        for colour in self._coloured():
             for k in range(3):
                 step = np.zeros_like(points)
                 step[colour] = self.axes[colour, k]
@@ -316,14 +314,19 @@ class _Problem:
                         rows.append((f * size + own[:, None] * channels + np.arange(channels)).ravel())
                         columns.append(np.full(len(own) * channels, 3 * body + k))
                         entries.append(change[own].ravel())
-        shape = (size * len(self.frames), points.size)
-        j = coo_matrix((np.concatenate(entries), (np.concatenate(rows), np.concatenate(columns))), shape).tocsr()
-        self.place(points)
-        return self.equations(j, residuals, points, values)
+        return self.equations((rows, columns, entries), residuals, points, values)
 
-    def equations(self, j: Any, residuals: list[np.ndarray], points: np.ndarray, values: Values) -> _Equations:
-        """Normal equations of the places' weighed derivatives `j` and of the variables'."""
+    def equations(
+        self, derivatives: tuple[list, list, list], residuals: list[np.ndarray], points: np.ndarray, values: Values
+    ) -> _Equations:
+        """Normal equations of the places' weighed derivatives, in pieces of rows, columns and entries, and of the
+        variables'."""
+        from scipy.sparse import coo_matrix
+
         size = residuals[0].size
+        rows, columns, entries = (np.concatenate(pieces) for pieces in derivatives)
+        j = coo_matrix((entries, (rows, columns)), (size * len(self.frames), points.size)).tocsr()
+        self.place(points)
         dense = np.zeros((j.shape[0], len(self.variables)))
         if self.variables:
             index = {v.name: i for i, v in enumerate(self.variables)}

@@ -143,7 +143,7 @@ class Canvas:
     """
 
     def __init__(self, rays: Callable[..., tuple], shape: tuple[int, int], side: int = SIDE):
-        self.shape, self.side, self.rays = shape, side, rays
+        self.shape, self.side = shape, side
         height, width = shape
         at = (np.arange(side) + 0.5) / side
         v, u, j, i = np.meshgrid(np.arange(height), np.arange(width), at, at, indexing="ij")

@@ -137,8 +137,6 @@ class Painted(_Problem):
         return found
 
     def linearise(self, points: np.ndarray, values: Values, state: State) -> _Equations:
-        from scipy.sparse import coo_matrix
-
         self.look(points, values)
         predictions, residuals = state
         self.scales = self.weights(values, predictions)
@@ -169,10 +167,7 @@ class Painted(_Problem):
                     rows.append((k * size + box.pixels[used][:, None] * channels + np.arange(channels)).ravel())
                     columns.append(np.repeat(3 * box.balls[ball] + axis, channels))
                     entries.append(value[used].ravel())
-        shape = (size * len(self.frames), points.size)
-        j = coo_matrix((np.concatenate(entries), (np.concatenate(rows), np.concatenate(columns))), shape).tocsr()
-        self.place(points)
-        return self.equations(j, residuals, points, values)
+        return self.equations((rows, columns, entries), residuals, points, values)
 
 
 @dataclass
@@ -205,6 +200,7 @@ class Seeker:
         progress: Callable[[str, int, int], None] | None = None,
     ):
         self.reopen, self.name, self.depths = reopen, name, depths
+        self.prior = sum(depths) / 2, (depths[1] - depths[0]) / np.sqrt(12)  # of equal chances between both
         self.variables, self.progress = variables, progress
         model = reopen(np.array([[0.0, 0.0, -sum(depths) / 2]]))
         self.diameter = size(model.scene.parts[name])
@@ -386,16 +382,16 @@ class Seeker:
         return np.array(picked)
 
     def _closer(
-        self, at: np.ndarray, found: Found, strict: float, shade: Sequence[np.ndarray], size: float
+        self, at: np.ndarray, found: Found, strict: float, shade: Sequence[np.ndarray], step: float
     ) -> np.ndarray:
-        """The same places, each moved to the best of those around it, `size` px and as many steps of depth away."""
+        """The same places, each moved to the best of those around it, `step` px and as many steps of depth away."""
         away = at - self.model.renderer._eye()
         distance = np.linalg.norm(away, axis=1)[:, None]
         line = away / distance
         across = np.cross(line, [0.0, 1.0, 0.0])
         across /= np.linalg.norm(across, axis=1)[:, None]
         steps = np.stack([self.pitch * across, self.pitch * np.cross(line, across), GRADE * line], 1)
-        moves = size * np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)
+        moves = step * np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)
         tried = at[:, None] + np.einsum("mk,nkc->nmc", moves, distance[..., None] * steps)
         each = [np.repeat(of, len(moves), 0) for of in shade]
         score = self.weigh(tried.reshape(-1, 3), found, strict, each).reshape(len(at), -1)
@@ -404,8 +400,7 @@ class Seeker:
     def _problem(self, points: np.ndarray) -> Painted:
         self.model = model = self.reopen(points)
         problem = Painted(model, self.name, self.variables(model), self.views, self.canvases, ROUGH)
-        top, bottom = self.depths
-        problem.prior = (top + bottom) / 2, (bottom - top) / np.sqrt(12)
+        problem.prior = self.prior
         return problem
 
     def settled(self, points: np.ndarray, values: Values, steps: int = SETTLE) -> Found:

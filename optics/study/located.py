@@ -114,9 +114,7 @@ def _located(
     model = reopen(np.array([[0.0, 0.0, -1.0]]))  # until the images at rest are read
     name = _crowd(model)
     layer: Any = model.scene.parts[name]
-    depths = layer.layer()
-    prior = sum(depths) / 2, (depths[1] - depths[0]) / np.sqrt(12)  # of equal chances between both
-    seeker = Seeker(reopen, name, at_rest(model), depths, solved_for, Values(dict(setup.values)), progress)
+    seeker = Seeker(reopen, name, at_rest(model), layer.layer(), solved_for, Values(dict(setup.values)), progress)
     points, values = seeker.seek()
     if not len(points):
         raise ValueError(
@@ -128,13 +126,20 @@ def _located(
     for round_ in range(ROUNDS):
         model = reopen(points)
         fit = refine(
-            model, name, solved_for(model), values, depth_prior=prior, missing=True, max_iterations=6, progress=progress
+            model,
+            name,
+            solved_for(model),
+            values,
+            depth_prior=seeker.prior,
+            missing=True,
+            max_iterations=6,
+            progress=progress,
         )
         points, values = seeker.seek(fit.points, fit.values) if round_ < ROUNDS - 1 else (fit.points, fit.values)
         if np.array_equal(points, fit.points):
             break
     if fit.chi2 < AMISS * fit.dof:  # none is missing: all pixels count by their noise
-        fit = refine(model, name, solved_for(model), values, depth_prior=prior, progress=progress)
+        fit = refine(model, name, solved_for(model), values, depth_prior=seeker.prior, progress=progress)
     write_places(file, fit.points)
     located = Located(file, fit, found, len(fit.points) - found)
     write_text(file.with_suffix(".json"), json.dumps(located.record(), indent=1))
@@ -156,11 +161,13 @@ def _crowd(model: SceneModel) -> str:
 
 
 def at_rest(model: SceneModel) -> list[int]:
-    """The frames whose skin is pressed least; of those that were made alike, the first."""
+    """The frames whose skin is pressed least; of those under the same lights, the first."""
     gel = model.scene.gel
     key = None if gel is None else model.scene.key(gel.name, "press depth")
     depths = [0.0 if key is None else float(f.parameters.get(key, model.base[key])) for f in model.frames]
     least = [i for i, depth in enumerate(depths) if depth == min(depths)]
-    powers = model.scene.powers.values()
-    lights = {i: tuple(str(model.frames[i].parameters.get(p)) for p in powers) for i in least}
-    return [i for i in least if next(k for k in least if lights[k] == lights[i]) == i]
+    first: dict[tuple, int] = {}
+    for i in least:
+        settings = model.frames[i].parameters
+        first.setdefault(tuple(str(settings.get(key)) for key in model.scene.powers.values()), i)
+    return list(first.values())

@@ -99,10 +99,9 @@ def test_a_table_that_is_none_is_refused(tmp_path, text, said):
     assert said in str(error.value)
 
 
-@pytest.mark.slow
-def test_places_and_parameters_come_back_with_their_errors(mitsuba, tmp_path):
-    """Fourteen beads by the numpy maker, started 0.08 mm aside and half a millimetre too deep or too high."""
-    from optics.fit.calibrate import variables_from
+@pytest.fixture
+def fourteen(mitsuba):
+    """Beads by the numpy maker, at rest and under one press: true values, true places, and a model of any table."""
     from optics.fit.scene_model import SceneModel
     from optics.proof.makers.particle import CAMERA, ParticleMaker
     from optics.proof.rigs.particle import ParticleGel
@@ -115,12 +114,22 @@ def test_places_and_parameters_come_back_with_their_errors(mitsuba, tmp_path):
     maker = ParticleMaker(scene, built, {}, CAMERA, 5)
     captures = maker.captures([(0.0, 0.0, 0.0), (2.0, -1.5, 0.6)])
     captures.parameters.update({k: built[k] for k in ("camera.x_fov", "dye.yield")})
-    truth = maker.rest()
+
+    def model(table):
+        return SceneModel(loader.load("particle_gel", {**rig.defines, "places": str(table)}), captures, CAMERA)
+
+    return built, maker.rest(), model
+
+
+@pytest.mark.slow
+def test_places_and_parameters_come_back_with_their_errors(fourteen, tmp_path):
+    """Fourteen beads, started 0.08 mm aside and half a millimetre too deep or too high."""
+    from optics.fit.calibrate import variables_from
+
+    built, truth, opened = fourteen
     start = truth + np.random.default_rng(0).normal(0, [0.08, 0.08, 0.5], truth.shape)
     write_places(tmp_path / "start.csv", start)
-    model = SceneModel(
-        loader.load("particle_gel", {**rig.defines, "places": str(tmp_path / "start.csv")}), captures, CAMERA
-    )
+    model = opened(tmp_path / "start.csv")
     variables = variables_from(model, ["*_ring.power"])
     fit = refine(model, "beads", variables, depth_prior=(2.25, 0.92))
     pulls = (fit.points - truth) / fit.errors
@@ -133,31 +142,15 @@ def test_places_and_parameters_come_back_with_their_errors(mitsuba, tmp_path):
 
 
 @pytest.mark.slow
-def test_beads_are_found_without_a_start(mitsuba, tmp_path, monkeypatch):
+def test_beads_are_found_without_a_start(fourteen, tmp_path, monkeypatch):
     """The same fourteen, of which nothing is known but the layer that holds them: all are found, and no other."""
-    from optics.fit.scene_model import SceneModel
-    from optics.proof.makers.particle import CAMERA, ParticleMaker
-    from optics.proof.rigs.particle import ParticleGel
-    from optics.scene import loader
     from optics.study import located
     from optics.study.setup import Setup
 
-    rig = ParticleGel()
-    rig.defines = {**rig.defines, "beads": "14", "fine": "4"}
-    scene = rig.scene()
-    built = rig.built(scene, 0)
-    maker = ParticleMaker(scene, built, {}, CAMERA, 5)
-    captures = maker.captures([(0.0, 0.0, 0.0), (2.0, -1.5, 0.6)])
-    captures.parameters.update({k: built[k] for k in ("camera.x_fov", "dye.yield")})
-
-    def opened(setup):
-        return SceneModel(
-            loader.load("particle_gel", {**rig.defines, "places": setup.defines["places"]}), captures, CAMERA
-        )
-
-    monkeypatch.setattr(located, "open_model", opened)
+    _, truth, opened = fourteen
+    monkeypatch.setattr(located, "open_model", lambda setup: opened(setup.defines["places"]))
     found = located.locate(Setup(captures="session"), tmp_path / "beads.csv")
-    truth, fit = maker.rest(), found.fit
+    fit = found.fit
     apart = np.linalg.norm(fit.points[:, None] - truth[None], axis=-1)
     nearest = apart.argmin(1)
     assert sorted(nearest) == list(range(14))
