@@ -436,19 +436,28 @@ def _check_levels(captures: Captures, where: str) -> None:
                 "remove it or expose it shorter"
             )
     if captures.noise is not None and captures.table is None:
-        least = captures.noise.black_level - SUNK * float(
-            np.max(captures.noise.sd(np.full(3, captures.noise.black_level)))
-        )
-        for what, values in used:
-            if values.size and (middle := float(np.median(values))) < least:
-                raise BadCapture(
-                    f"{where}: {what}: half of its values are {middle:g} DN or less, far below what it has without "
-                    "light, "
-                    f"black_level = {captures.noise.black_level:g} DN; allowed: {least:.4g} DN or more; correct "
-                    "[noise] black_level"
-                )
+        _check_black(captures, used, where)
     if captures.noise is not None and not any(_lit(captures, f).any() for f in captures.frames):
         raise BadCapture(f"{where}: {_unusable(captures)}")
+
+
+def _check_black(captures: Captures, used: Sequence[tuple[str, np.ndarray]], where: str) -> None:
+    """Images far below their black level: refused where half of their values are cut off at 0, else a warning."""
+    noise = captures.noise
+    least = noise.black_level - SUNK * float(np.max(noise.sd(np.full(3, noise.black_level))))
+    sunk = [(what, float(np.median(values))) for what, values in used if values.size]
+    sunk = [(what, middle) for what, middle in sunk if middle < least]
+    if not sunk:
+        return
+    what, middle = min(sunk, key=lambda one: one[1])
+    text = (
+        f"{what}: half of its values are {middle:g} DN or less, far below what it has without light, "
+        f"black_level = {noise.black_level:g} DN"
+    )
+    if captures.bits and middle <= 0:
+        raise BadCapture(f"{where}: {text}; allowed: {least:.4g} DN or more; correct [noise] black_level")
+    others = f" (so are {len(sunk) - 1} other frames)" if len(sunk) > 1 else ""
+    captures.warnings.append(f"{text}{others}: either [noise] black_level is too high, or the camera has a dark offset")
 
 
 def _lit(captures: Captures, frame: Frame) -> np.ndarray:

@@ -382,8 +382,10 @@ def _fit_at(descent: Descent, history: list[float], reason: str, start: np.ndarr
         start=start,
         at_bound=[
             v.name
-            for v, t, lo, hi, var in zip(variables, theta, descent.low, descent.high, np.diag(covariance))
-            if t <= lo or t >= hi or (v.parameter.factor and t < OFF * np.sqrt(var) < np.inf)
+            for v, t, lo, hi, sd, best in zip(
+                variables, theta, descent.low, descent.high, np.sqrt(np.diag(covariance)), theta + covariance @ normal.b
+            )
+            if t <= lo or t >= hi or (v.parameter.factor and sd < np.inf and (t < OFF * sd or best <= lo))
         ],
         normal=normal,
     )

@@ -275,6 +275,8 @@ def test_a_factor_falls_but_is_not_switched_off():
     found = fit(model, variables, Values(dict.fromkeys(model.parameters, 50.0)))
     assert found.converged and 0 < found.estimate[1] < found.sd[1] and found.at_bound == ["led_1.power"]
     assert min(b / a for a, b in zip(seen, seen[1:])) >= 0.1 * (1 - 1e-9)
+    model, variables = lamps([50.0, -20.0])  # far below black: no power above 0 is best, however few its steps were
+    assert fit(model, variables, Values(dict.fromkeys(model.parameters, 50.0))).at_bound == ["led_1.power"]
     off = fit(model, variables, Values({"led_0.power": 50.0, "led_1.power": 0.0}))
     assert off.estimate[1] == 0.0 and off.at_bound == ["led_1.power"]  # a lamp that is off may stay off
     light, variables = lamps([50.0, 40.0])

@@ -234,6 +234,21 @@ def test_what_costs_trust_is_a_warning(folder):
     assert load(folder, 'scene = "bench"\n' + FRAME + NOISE).warnings == []
 
 
+def test_a_frame_below_its_black_level_is_refused_only_where_it_is_cut_off(folder):
+    sunk = 'scene = "bench"\n[[frames]]\nimage = "frames/sunk.png"\n' + FRAME + NOISE.replace("1.5", "1.0")
+
+    def frame(values):
+        Image.fromarray(values.astype(np.uint8)).save(folder / "frames" / "sunk.png")
+
+    dark = np.random.default_rng(0).integers(0, 2, (6, 8))  # DN, for a black level of 8
+    frame(np.maximum(dark, 1))
+    warned = "frame 0 .*half of its values are 1 DN or less.*black_level is too high, or the camera has a dark offset"
+    assert any(re.search(warned, w) for w in load(folder, sunk).warnings)
+    frame(dark * 0)
+    with pytest.raises(BadCapture, match="half of its values are 0 DN or less.*correct .noise. black_level"):
+        load(folder, sunk)
+
+
 @pytest.mark.parametrize(
     ("suffix", "dtype", "channels"),
     [
