@@ -2,10 +2,10 @@
 
     python examples/measured_spectra.py [image.png]
 
-Renders each scene twice, with channels as integrals over the wavelength: with the round widths that a drawing would
-assume, and with those of the scene's sources (digit.xml, vi2tap.xml say which). Prints, per channel, the change of the
-mean and the rms difference that is left when every LED, or the pigment, takes the power that fits best, as a
-calibration would: what only spectra can explain. Draws both images and ten times their difference."""
+Renders each scene twice, with channels as integrals over the wavelength: with Gaussians of the round widths that a
+drawing would assume, and with what the scene's sources say (digit.xml, vi2tap.xml name them). Prints, per channel, the
+change of the mean and the rms difference that is left when every LED, or the pigment, takes the power that fits best,
+as a calibration would: what only spectra can explain. Draws both images and ten times their difference."""
 
 import sys
 from pathlib import Path
@@ -19,7 +19,10 @@ NIKON = "Nikon 5100 (NPL)"
 CASES = {  # scene: (what is common, round numbers, what takes up a change of power)
     "digit": (
         {"bands": "auto", "depth": "0.8"},
-        {"fwhm_red": "20", "fwhm_green": "35", "fwhm_blue": "25"},
+        {
+            **{f"line_{colour}": "" for colour in ("red", "green", "blue")},
+            **{"fwhm_red": "20", "fwhm_green": "35", "fwhm_blue": "25"},
+        },
         ("led_red", "led_green", "led_blue"),
     ),
     "vi2tap": (
@@ -64,8 +67,8 @@ def shown(linear: np.ndarray, full: float) -> np.ndarray:
 def main(file: Path | None) -> None:
     from optics.files.charts import Chart
 
-    figure = Chart(figsize=(9.0, 7.2), layout="constrained")
-    axes = figure.subplots(2, 3)
+    figure = Chart(figsize=(9.0, 6.4), layout="constrained")
+    axes = figure.subplots(2, 3, height_ratios=(3, 2))
     for row, name in zip(axes, CASES):
         old, new, lines = compared(name)
         print("\n".join(lines))

@@ -11,6 +11,8 @@ spectra      a new press in auto bands over the same in the scene's fixed ones, 
              a wall under a white LED by auto bands and by stock `path` with wavelengths by Monte Carlo: time at equal
              noise
 ranking      every effect scored on 16 frames of 160 x 120, presses solved for as well
+workers      a batch by two worker processes and by one, beside what two processes of the machine do at all: plain
+             loops, and sums over arrays that no cache holds
 cuda         the new press and the ranking on an NVIDIA device, where there is one; on the processor: press, ranking
 """
 
@@ -394,7 +396,75 @@ def presses() -> None:
     against_stock(renderer, now, ours)
 
 
-PARTS = {"presses": presses, "grid": printed_grid, "spectra": spectra, "ranking": ranking, "cuda": cuda}
+BATCH = """scene = "gelsight"
+out = "images"
+count = COUNT
+outputs = ["exr", "dn"]
+layers = ["spectral"]
+[defines]
+width = 96
+height = 72
+[sample]
+"gel.press_x" = { uniform = [-3, 3] }
+"gel.press_y" = { uniform = [-3, 3] }
+"gel.press_depth" = { log_uniform = [0.1, 1] }
+[noise]
+system_gain = 0.05
+dark_noise = 1.0
+black_level = 2.0
+saturation = 255.0
+"""
+PLAIN = {
+    "loops": "n = 0\nfor i in range(20_000_000): n += i * i",
+    "sums over arrays": "import numpy\na = numpy.zeros(20_000_000)\nfor i in range(60): a += 1.0",
+}
+
+
+def batch_times(count: int, workers: int) -> tuple[float, float]:
+    """Images per second between a tenth and nine tenths of a batch, and seconds of the whole command."""
+    with tempfile.TemporaryDirectory() as folder:
+        job = Path(folder) / "job.toml"
+        job.write_text(BATCH.replace("COUNT", str(count)))
+        start = time.perf_counter()
+        command = [sys.executable, "-m", "optics.cli", "batch", str(job), "--workers", str(workers), "--quiet"]
+        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        whole = time.perf_counter() - start
+        ends = sorted(file.stat().st_mtime for file in (Path(folder) / "images/images").glob("*.exr"))
+    first, last = count // 10, count - count // 10 - 1
+    return (last - first) / (ends[last] - ends[first]), whole
+
+
+def side_by_side(code: str, processes: int) -> float:
+    """Seconds until so many processes have each run the code once, with one thread each."""
+    one_thread = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
+    start = time.perf_counter()
+    running = [subprocess.Popen([sys.executable, "-c", code], env=one_thread) for _ in range(processes)]
+    for process in running:
+        process.wait()
+    return time.perf_counter() - start
+
+
+def workers(count: int = 300) -> None:
+    (one, alone), (two, both) = (batch_times(count, n) for n in (1, 2))
+    row(
+        "two workers / one, GelSight 96 x 72",
+        f"{two / one:.2f} x",
+        f"{two:.1f} and {one:.1f} images/s; {alone / both:.2f} x with starts, {count} images; target 1.9 x",
+    )
+    for name, code in PLAIN.items():
+        laps = [[side_by_side(code, n) for n in (1, 2)] for _ in range(3)]
+        most = median(2 * alone / both for alone, both in laps)
+        row(f"  two processes / one of this machine, {name}", f"{most:.2f} x")
+
+
+PARTS = {
+    "presses": presses,
+    "grid": printed_grid,
+    "spectra": spectra,
+    "ranking": ranking,
+    "workers": workers,
+    "cuda": cuda,
+}
 ALONE = {"press": press_of_ours}  # the first lines of `presses` by themselves
 
 

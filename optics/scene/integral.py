@@ -50,10 +50,9 @@ def numbers_of(scene, part: str, values: Mapping) -> SimpleNamespace:
 def spectrum_of(scene, light: str, values: Mapping, nm: np.ndarray) -> np.ndarray:
     """(N,) power of a light per nm with what effects make of it, its integral 1 over all wavelengths."""
     part, own = scene.parts[light], numbers_of(scene, light, values)
-    curve = part.curves.get("spectrum")
-    if curve is None and not hasattr(own, "wavelength"):
+    if "spectrum" not in part.curves and not hasattr(own, "wavelength"):
         return np.full(len(nm), 1 / line.WHITE)
-    shape = line.changed(line.relative(own, curve), part.active("spectrum", own), own)
+    shape = line.changed(line.of_part(part, own), part.active("spectrum", own), own)
     return np.asarray(shape(nm) / shape.area + 0.0 * nm)
 
 
@@ -131,8 +130,8 @@ class Integral:
 
     def width(self, light: str, values: Mapping):
         """Area of a light's spectrum over its peak, nm."""
-        own, curve = numbers_of(self.scene, light, values), self.scene.parts[light].curves.get("spectrum")
-        return line.relative(own, curve).area if curve is not None or hasattr(own, "wavelength") else line.WHITE
+        own, part = numbers_of(self.scene, light, values), self.scene.parts[light]
+        return line.of_part(part, own).area if "spectrum" in part.curves or hasattr(own, "wavelength") else line.WHITE
 
     def spectral_keys(self, light: str) -> tuple[str, ...]:
         """The parameters that a light's spectrum depends on."""

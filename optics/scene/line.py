@@ -1,4 +1,4 @@
-"""The spectrum of a light: a Gaussian line, a measured curve, or white; and what effects make of it.
+"""The spectrum of a light: a line, a measured curve, or white; and what effects make of it.
 
 The same functions serve numpy, complex numbers among them, and Dr.Jit."""
 
@@ -55,25 +55,41 @@ class Spectrum:
         return self.power(nm)
 
 
-def relative(own, curve=None) -> Spectrum:
-    """The spectrum of a curve, else a Gaussian about `own.wavelength`, else 1 everywhere."""
+def relative(own, curve=None, form=None) -> Spectrum:
+    """The spectrum of a curve; else a line about `own.wavelength`, as wide as `own.fwhm`; else 1 everywhere.
+
+    form   the line's form, a curve (optics.spectra.curve) of which only peak and width are replaced; None: a Gaussian
+    """
     if curve is not None:
         peak = float(curve.values.max())
         return Spectrum(lambda nm: curve(nm) / peak, curve.centre, curve.area / peak, 1.0)
 
     def line(nm):
         u = (nm - own.wavelength) / own.fwhm
-        return where(real(own.wavelength) > 0, exp(-4 * math.log(2) * u * u), 1.0 + 0.0 * u)
+        if form is None:
+            return where(real(own.wavelength) > 0, exp(-4 * math.log(2) * u * u), 1.0 + 0.0 * u)
+        return where(
+            real(own.wavelength) > 0, form(form.peak + form.fwhm * u) / float(form.values.max()), 1.0 + 0.0 * u
+        )
 
     coloured = real(own.wavelength) > 0
     zero = 0.0 * own.wavelength
-    width = math.sqrt(math.pi / (4 * math.log(2))) * own.fwhm
+    if form is None:
+        width, centre = math.sqrt(math.pi / (4 * math.log(2))) * own.fwhm, own.wavelength
+    else:
+        width = form.area / float(form.values.max()) / form.fwhm * own.fwhm
+        centre = own.wavelength + (form.centre - form.peak) / form.fwhm * own.fwhm
     return Spectrum(
         line,
-        where(coloured, own.wavelength + zero, 595.0 + zero),
+        where(coloured, centre + zero, 595.0 + zero),
         where(coloured, width + zero, WHITE + zero),
         where(coloured, 1.0 + zero, zero),
     )
+
+
+def of_part(part, own) -> Spectrum:
+    """The spectrum of a light, at its numbers `own`, by the curves that it was given."""
+    return relative(own, part.curves.get("spectrum"), part.curves.get("line_form"))
 
 
 def changed(base: Spectrum, functions: Sequence[Callable], own) -> Spectrum:

@@ -31,12 +31,15 @@ class Curve:
 
     kind     one of KINDS
     source   what it was read from, in words
+    cubic    monotone cubics in between (PCHIP, Fritsch & Butland 1984): of a curve that is moved or stretched the slope
+             counts, which straight lines make jump
     """
 
     nm: np.ndarray
     values: np.ndarray
     kind: str = "power"
     source: str = ""
+    cubic: bool = False
 
     def __call__(self, wavelengths: Any) -> Any:
         """The values at wavelengths in nm: an array, complex ones among them (analytic but for the corners), or a
@@ -51,6 +54,8 @@ class Curve:
             slope = (np.diff(self.values) / np.diff(self.nm))[place]
             low = self.values[place]
         found = low + slope * (at - self.nm[place])
+        if self.cubic:
+            found = np.polyval(self._pieces[:, place], at - self.nm[place])
         below, above = at.real < self.nm[0], at.real > self.nm[-1]
         ends = (0.0, 0.0) if KINDS[self.kind][2] else (self.values[0], self.values[-1])
         return np.where(below, ends[0], np.where(above, ends[1], found))
@@ -87,6 +92,9 @@ class Curve:
     @cached_property
     def area(self) -> float:
         """Integral over the wavelength."""
+        if self.cubic:
+            fine = np.linspace(*self.span, max(round((self.nm[-1] - self.nm[0]) / STEP), 1) + 1)
+            return float(np.trapezoid(self(fine), fine))
         return float(np.trapezoid(self.values, self.nm))
 
     @cached_property
@@ -95,6 +103,25 @@ class Curve:
         fine = np.arange(self.nm[0], self.nm[-1] + STEP / 2, STEP)
         weights = self(fine)
         return float((fine * weights).sum() / weights.sum())
+
+    @cached_property
+    def peak(self) -> float:
+        """Wavelength of the largest value, nm."""
+        return float(self.nm[int(np.argmax(self.values))])
+
+    @cached_property
+    def fwhm(self) -> float:
+        """Distance of the outermost wavelengths with half of the largest value, nm; to an end, where it has more."""
+        nm = np.linspace(*self.span, max(round((self.nm[-1] - self.nm[0]) / (STEP / 25)), 1) + 1)
+        return float(np.ptp(nm[self(nm) >= self.values.max() / 2]))
+
+    @cached_property
+    def _pieces(self) -> np.ndarray:
+        """(4, N - 1) coefficients of the cubics, the highest power first."""
+        from scipy.interpolate import PchipInterpolator
+
+        pieces: np.ndarray = PchipInterpolator(self.nm, self.values).c
+        return pieces
 
 
 def constant(value: float = 1.0, kind: str = "transmittance") -> Curve:

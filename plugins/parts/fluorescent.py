@@ -115,14 +115,19 @@ def build():
         def overlap(self, led):
             """int w a l dl of an LED with the peak 1, and the area of its spectrum, nm."""
             lamp, measured = led.curves.get("spectrum"), self.curves.get("excitation_spectrum")
+            form = led.curves.get("line_form")
             s1, s2 = led.fwhm / WIDTH, self.absorption_fwhm / WIDTH
             area = math.sqrt(2 * math.pi) * s1
-            if lamp is None and measured is None:
+            if lamp is None and measured is None and form is None:
                 square = dr.square(s1) + dr.square(s2)
                 middle = (led.wavelength * dr.square(s2) + self.absorption_peak * dr.square(s1)) / square
                 apart = dr.exp(-dr.square(led.wavelength - self.absorption_peak) / (2 * square))
                 return self.absorptance * area * s2 / dr.sqrt(square) * apart * middle, area
-            if lamp is None:
+            if form is not None:
+                scale = led.fwhm / form.fwhm
+                rule = [(led.wavelength + (x - form.peak) * scale, w * scale) for x, w in gauss_rule(form)]
+                area = form.area / float(form.values.max()) * scale
+            elif lamp is None:
                 x, w = np.polynomial.hermite.hermgauss(NODES)
                 rule = [(led.wavelength + math.sqrt(2) * s1 * x, math.sqrt(2) * s1 * w) for x, w in zip(x, w)]
             else:

@@ -8,7 +8,7 @@ with the distance d = |S - x| (mm) of the LED's position S from x, the unit vect
 axis p (so that a is the angle between axis and beam), the power eta = `power` and the lobe exponent mu (1 for a
 Lambertian chip, larger for a lens). V is 1 where the straight line to the LED is free and else 0, T what the gel's
 effects let pass, f the membrane's reflection, theta the angle between s and the skin's normal. w is the relative
-spectrum: a Gaussian of the given peak wavelength and full width at half maximum, or 1 in every band when `wavelength`
+spectrum: a line of the given peak wavelength and full width at half maximum, or 1 in every band when `wavelength`
 is 0 (a white LED). power_b is `power_r`, `power_g`, `power_b` in the first three bands, 1 in a fourth: what an LED of
 unknown spectrum is calibrated by. They share a scale with `power` and, over all LEDs of a band, with the membrane's
 rho: hold one of them. With an emitting area A > 0 the source is a disc across the axis, of radius sqrt(A/pi): shadows
@@ -26,14 +26,17 @@ XML
     placed string: FILE:DESIGNATOR of a pick-and-place file, for x and y on the board, mm
     spectrum string: measured power over the wavelength, in place of the Gaussian: a file, a name, a law, or a spectrum
         of Mitsuba's (see "Spectra" in the guide); relative to its peak, of channels as integrals to its area
+    line_form string: the form of the line, in place of a Gaussian: a measured spectrum as of `spectrum`, which is moved
+        to `wavelength` and stretched to `fwhm`; these are its own where they are not given
 """
 
 import math
+from dataclasses import replace
 
 from optics.errors import BadScene
 from optics.scene.checking import agree, made
 from optics.scene.declare import Part
-from optics.scene.line import LINE, changed, relative
+from optics.scene.line import LINE, changed, of_part
 from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
 from optics.scene.pick_and_place import placed
@@ -169,6 +172,17 @@ def build():
                     props[name] = value
             self.declare(props)
             self.read_spectrum(props, "spectrum", "power")
+            form = self.read_spectrum(props, "line_form", "power")
+            if form is not None and "spectrum" in self.curves:
+                raise BadScene(
+                    f"led '{self.name}': 'spectrum' and 'line_form' are both given; allowed: a spectrum as it is, or "
+                    "the form of a line, which 'wavelength' and 'fwhm' place"
+                )
+            if form is not None:
+                self.curves["line_form"] = form = replace(form, cubic=True)
+                for number, found in (("wavelength", form.peak), ("fwhm", form.fwhm)):
+                    if number not in props:
+                        self.hold(number, found)
             nominal = [float(t) - self.number(n) for t, n in zip(target, "xyz")]
             if not any(nominal):
                 raise ValueError(
@@ -224,11 +238,11 @@ def build():
                 wavelengths = self.band
             if self.lane is not None:
                 return self.lane
-            functions, curve = self.functions("spectrum"), self.curves.get("spectrum")
-            if functions or curve is not None or self.integral is not None:
+            functions = self.functions("spectrum")
+            if functions or self.curves or self.integral is not None:
                 nm = mi.UnpolarizedSpectrum(wavelengths)
-                power = changed(relative(self, curve), functions, self)(nm)
-                return power if self.integral is None else power / relative(self, curve).area
+                power = changed(of_part(self, self), functions, self)(nm)
+                return power if self.integral is None else power / of_part(self, self).area
             u = (mi.UnpolarizedSpectrum(wavelengths) - self.wavelength) / self.fwhm
             return dr.select(self.wavelength > 0, dr.exp(-4 * math.log(2) * dr.square(u)), 1.0)
 

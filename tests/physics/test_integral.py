@@ -28,6 +28,8 @@ SIZE = {"width": "24", "height": "32", "depth": "0.5"}
 def digit(mitsuba, folder, bands, **attributes):
     """DIGIT with other bands; attributes of LEDs in XML as {led_red: '<...>'}."""
     text = (shipped("scenes") / "digit.xml").read_text(encoding="utf-8")
+    if any('"spectrum"' in xml for xml in attributes.values()):
+        text = re.sub(r'<string name="line_form"[^>]*>', "", text)
     for part, xml in attributes.items():
         text = re.sub(rf'(<(?:emitter|sensor|bsdf) type="\w+" id="{part}">)', rf"\1 {xml}", text)
     file = folder / f"digit_{len(list(folder.iterdir()))}.xml"
@@ -43,6 +45,7 @@ def test_lines_give_what_bands_at_their_peaks_give(mitsuba, tmp_path):
     for bands in ("625, 530, 470", "auto"):
         text = (shipped("scenes") / "digit.xml").read_text(encoding="utf-8")
         text = re.sub(r'name="fwhm" value="[^"]+"', 'name="fwhm" value="1"', text)
+        text = re.sub(r'<string name="line_form"[^>]*>', "", text)  # Gaussians: measured lines have long flanks
         file = tmp_path / "lines.xml"
         file.write_text(text, encoding="utf-8")
         images.append(RenderJob(loader.load(file, {**SIZE, "bands": bands})).take().camera)
@@ -57,10 +60,10 @@ def auto(mitsuba, tmp_path_factory):
 
 @pytest.mark.slow
 def test_few_nodes_give_what_many_bands_give(mitsuba, auto, tmp_path):
-    """Ten bands in place of 161, whose trapezium rule of 2.5 nm errs by 3e-4 at the kinks of the sensitivities, which
-    are straight lines over 5 nm."""
-    # two nodes in the range of a line, one in those that its flanks reach, or a phosphor's leak would
-    assert len(auto.integral.nm) == 10 and auto.integral.error < 1e-12  # nothing on the way depends on the wavelength
+    """Eleven bands in place of 161, whose trapezium rule of 2.5 nm errs by 3e-4 at the kinks of the sensitivities,
+    which are straight lines over 5 nm."""
+    # two nodes in a range that holds a tenth of a line, one in those that its flanks reach, or a phosphor's leak would
+    assert len(auto.integral.nm) == 11 and auto.integral.error < 1e-12  # nothing on the way depends on the wavelength
     fine = digit(mitsuba, tmp_path, "380:780:2.5")
     found, expected = (RenderJob(s).take() for s in (auto, fine))
     assert found.camera == pytest.approx(expected.camera, abs=4e-4 * expected.camera.max())
@@ -154,22 +157,65 @@ def test_a_straight_line_needs_two_nodes(mitsuba, tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("key", ["led_green.wavelength", "led_red.fwhm"])
 def test_derivatives_by_peak_and_width(auto, mitsuba, tmp_path, key):
-    """Auto bands: complex step through the matrix, against central differences, whose error is the third order: 1e-6
-    of a step of 0.05 nm over a width of 20 nm. Fixed bands: forward mode against 0.5 nm, 2e-3 of the largest."""
+    """Auto bands: complex step through the matrix, against central differences. Cubics between the values of a measured
+    line have bends that jump, so steps are .002 nm: 2e-6 off, as the square of the step (8e-4 with .05 nm).
+
+    Fixed bands: forward mode, off the corners of Dr.Jit's table in steps of .25 nm, against steps of .005 nm. Single
+    precision makes 4e-3 of the largest of that."""
     base = auto.values()
     job = RenderJob(auto)
     image = job.renderer.radiance(base)
     found = job.developer.linearise(image, base).of_parameter((key,))
-    sides = [job.developer.develop(image, {**base, key: base[key] + s * 0.05}) for s in (1, -1)]
+    sides = [job.developer.develop(image, {**base, key: base[key] + s * 0.002}) for s in (1, -1)]
     assert auto.parameters[key].how == "image" and np.abs(found).max() > 0.1
-    assert found == pytest.approx((sides[0] - sides[1]) / 0.1, rel=1e-4, abs=1e-5)
+    assert found == pytest.approx((sides[0] - sides[1]) / 0.004, rel=1e-4, abs=1e-5)
     fine = digit(mitsuba, tmp_path, "400:700:5")
     renderer = Renderer(fine)
-    own = fine.values()
     led = key.split(".")[0]
+    own = {**fine.values(), f"{led}.wavelength": fine.values()[f"{led}.wavelength"] + 0.1}
     tangent = renderer.led_tangent(own, led, key)
-    sides = [renderer.image({**own, key: own[key] + s * 0.5}, led) for s in (1, -1)]
-    assert tangent == pytest.approx(sides[0] - sides[1], abs=2e-3 * float(np.abs(tangent).max()))
+    sides = [renderer.image({**own, key: own[key] + s * 0.005}, led) for s in (1, -1)]
+    assert tangent == pytest.approx((sides[0] - sides[1]) / 0.01, abs=5e-3 * float(np.abs(tangent).max()))
+
+
+def test_a_measured_line_is_moved_and_stretched(mitsuba, tmp_path):
+    """Channels of an LED of a measured form at 528 nm, 36 nm wide: sums in steps of .1 nm over the table of the file as
+    it stands, moved and stretched here; by auto bands and by many. Its own peak and width where none are given."""
+    file = shipped("scenes") / "spectra" / "led_ingan_518.csv"
+    nm, power = np.loadtxt(file, delimiter=",", skiprows=5).T
+    top = int(power.argmax())
+    left, right = np.interp(0.5, power[2 : top + 1], nm[2 : top + 1]), np.interp(-0.5, -power[top:], nm[top:])
+    xml = (
+        '<scene version="3.0.0"><integrator type="tactile" id="integrator"><string name="bands" value="BANDS"/>'
+        f'</integrator><sensor type="camera" id="camera"><string name="sensitivity" value="{NIKON}"/></sensor>'
+        '<shape type="rectangle" id="floor"><bsdf type="membrane" id="paint"/></shape>'
+        '<emitter type="led" id="led"><string name="line_form" value="led_ingan_518.csv"/>PLACE</emitter></scene>'
+    )
+
+    def loaded(bands, place):
+        scene = tmp_path / "scene.xml"
+        scene.write_text(xml.replace("BANDS", bands).replace("PLACE", place), encoding="utf-8")
+        return loader.load(scene)
+
+    own = loaded("auto", "").values()
+    assert own["led.wavelength"] == pytest.approx(nm[top], abs=0.1)
+    assert own["led.fwhm"] == pytest.approx(right - left, abs=0.05)
+    place = '<float name="wavelength" value="528"/><float name="fwhm" value="36"/>'
+    fine = np.arange(380.0, 780.0, 0.1)
+    line = np.interp(nm[top] + (fine - 528) * (right - left) / 36, nm, power, left=0, right=0)
+    quantum = np.stack([np.interp(fine, q.nm, q.values, left=0, right=0) for q in read_channels(NIKON)])
+    expected = quantum @ line / line.sum()
+    for bands in ("auto", "380:780:1"):
+        integral = loaded(bands, place).integral
+        values = integral.base
+        if bands == "auto":
+            found = integral.matrix(values).sum(1) * integral.unit
+        else:
+            found = integral.matrix(values) @ integral.spectrum("led", values)[::4] * integral.unit
+        assert found == pytest.approx(expected, abs=1e-3 * expected.max())  # cubics for straight lines: 5e-4
+    both = place + '<string name="spectrum" value="gaussian(530, 30)"/>'
+    with pytest.raises(BadScene, match="'spectrum' and 'line_form' are both given; allowed"):
+        loaded("auto", both)
 
 
 @pytest.mark.parametrize("bands", ["auto", "400:700:5"])
@@ -279,14 +325,17 @@ def test_pigments_and_ultraviolet_leds_are_given_by_curves(mitsuba, tmp_path):
     assert curves.count("LAMP") == 2 and "emission_spectrum" in curves
     (tmp_path / "curves.xml").write_text(curves.replace("LAMP", "gaussian(275, 11)"), encoding="utf-8")
     (tmp_path / "far.xml").write_text(curves.replace("LAMP", "gaussian(900, 11)"), encoding="utf-8")
+    formed = curves.replace('"spectrum" value="LAMP"', '"line_form" value="gaussian(300, 20)"')  # moved to 275, 11 nm
+    (tmp_path / "formed.xml").write_text(formed, encoding="utf-8")
     small = {"width": "32", "height": "24", "x_fov": "60", "sensitivity": NIKON, "analyzer": "90"}
     for bands in ("auto", "620, 540, 460"):
         images = [
             RenderJob(loader.load(scene, {**small, "bands": bands})).take().camera
-            for scene in ("vi2tap", tmp_path / "curves.xml")
+            for scene in ("vi2tap", tmp_path / "curves.xml", tmp_path / "formed.xml")
         ]
         assert images[0].max() > 20
-        assert images[1] == pytest.approx(images[0], abs=2e-3 * images[0].max())  # lines between points 2 nm apart
+        for other in images[1:]:  # lines between points 2 nm apart
+            assert other == pytest.approx(images[0], abs=2e-3 * images[0].max())
     with pytest.raises(BadScene, match="uv_left.spectrum.*is the unit nm"):
         loader.load(tmp_path / "far.xml", small)
 

@@ -221,7 +221,11 @@ class DigitColour(Digit):
     random = ()
     pairs = ()
     mistakes = ("gain +20 %", "gain -20 %", "pattern 0.3 %")
-    defines = NODES["lens"]
+    defines = {
+        **NODES["lens"],
+        **{f"line_{name}": "" for name in ("red", "green", "blue")},  # Gaussians, as the maker's
+        **{f"fwhm_{led.removeprefix('led_')}": f"{lines[0].width:g}" for led, lines in WildColour.lamps.items()},
+    }
     samples = 1024  # of a pixel by the maker: with 256, what they miss pulls a yellowing of the gel by 0.2 to 0.4 sd
     several = {
         "LED centre shift": tuple(f"led_{c}.centre_shift" for c in ("red", "green", "blue")),
