@@ -85,6 +85,7 @@ class Maker:
         self.frames = {
             n: np.array([[float(c[0]) for c in axis] for axis in led.frame]) for n, led in scene.leds.items()
         }
+        self.lines = {n: led.curves["line_form"] for n, led in scene.leds.items() if "line_form" in led.curves}
         self.effects = dict(effects or {})
         unknown = set(self.effects) - set(MAKERS)
         if unknown:
@@ -182,11 +183,20 @@ class Maker:
         }
 
     def colour(self, led: str) -> np.ndarray:
-        """(3,) share of an LED's power in each band: a Gaussian about its wavelength, or white, times its power per
-        band."""
+        """(3,) share of an LED's power in each band: a Gaussian about its wavelength, the straight lines of a measured
+        table moved there, or white, times its power per band."""
         v = self.values
         peak, width = v[f"{led}.wavelength"], v[f"{led}.fwhm"]
-        line = np.exp(-4 * np.log(2) * ((self.bands - peak) / width) ** 2) if peak > 0 else np.ones(3)
+        table = self.lines.get(led)
+        if peak <= 0:
+            line = np.ones(3)
+        elif table is None:
+            line = np.exp(-4 * np.log(2) * ((self.bands - peak) / width) ** 2)
+        else:
+            power, top = table.values / table.values.max(), int(table.values.argmax())
+            left = np.interp(0.5, power[: top + 1], table.nm[: top + 1])
+            right = np.interp(-0.5, -power[top:], table.nm[top:])
+            line = np.interp(table.nm[top] + (self.bands - peak) * (right - left) / width, table.nm, power, 0, 0)
         return line * [v[f"{led}.power_{c}"] for c in "rgb"]
 
     def disc(self, led: str) -> dict:
