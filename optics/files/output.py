@@ -11,7 +11,7 @@ import re
 import shutil
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib import metadata
 from pathlib import Path
 
@@ -68,34 +68,50 @@ def alone(file: Path, said: str) -> Iterator[None]:
 
 
 @contextmanager
+def folders_for(*places: Path) -> Iterator[None]:
+    """Make folders; where the block ends with an error, those that were not there and are empty go again."""
+    new = {p for place in places for p in (place, *place.parents) if not p.exists()}
+    try:
+        for place in places:
+            place.mkdir(parents=True, exist_ok=True)
+        yield
+    except BaseException:
+        for folder in sorted(new, key=lambda p: len(p.parts), reverse=True):
+            with suppress(OSError):  # it holds something, or was not made
+                folder.rmdir()
+        raise
+
+
+@contextmanager
 def replacing(path: str | Path) -> Iterator[Path]:
     """A temporary file beside `path` that replaces it when the block ends without an error; removed otherwise."""
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, "is a folder; choose the name of a file", str(path))
     if path.exists() and not path.is_file():  # /dev/null, /dev/stdout: written to, never replaced
         yield path
         return
     temporary = path.parent / f".{path.stem}.{uuid.uuid4().hex}{path.suffix}"
-    try:
-        with naming(path, temporary):
-            yield temporary
-            os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with folders_for(path.parent):
+        try:
+            with naming(path, temporary):
+                yield temporary
+                os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
 
 
 @contextmanager
 def together(files: Sequence[Path]) -> Iterator[None]:
     """Write several files of one result: where the block ends with an error, those that it made are removed again."""
     before = {file for file in files if file.exists()}
-    try:
-        yield
-    except BaseException:
-        for file in set(files) - before:
-            file.unlink(missing_ok=True)
-        raise
+    with folders_for(*(file.parent for file in files)):
+        try:
+            yield
+        except BaseException:
+            for file in set(files) - before:
+                file.unlink(missing_ok=True)
+            raise
 
 
 def write_text(path: str | Path, text: str) -> Path:
@@ -119,21 +135,22 @@ def new_folder(folder: str | Path, *, replace: bool = False) -> Iterator[Path]:
         raise OutputExists(f"{folder} holds a study, which is never replaced; choose another folder")
     temporary = folder.parent / f".{folder.name}.{uuid.uuid4().hex}"
     old = temporary.with_name(temporary.name + ".old")
-    temporary.mkdir(parents=True)
-    try:
-        with naming(folder, temporary):
-            yield temporary
-        if folder.exists():
-            folder.rename(old)
+    with folders_for(folder.parent):
         try:
-            temporary.rename(folder)
-        except OSError:
-            if old.exists():
-                old.rename(folder)
-            raise
-        shutil.rmtree(old, ignore_errors=True)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+            temporary.mkdir()
+            with naming(folder, temporary):
+                yield temporary
+            if folder.exists():
+                folder.rename(old)
+            try:
+                temporary.rename(folder)
+            except OSError:
+                if old.exists():
+                    old.rename(folder)
+                raise
+            shutil.rmtree(old, ignore_errors=True)
+        finally:
+            shutil.rmtree(temporary, ignore_errors=True)
 
 
 def check_new_folder(folder: str | Path) -> None:

@@ -297,6 +297,13 @@ def test_a_full_disk_is_said_with_the_file(tmp_path):
     ):
         file.write_text("half")
         raise OSError(28, "No space left on device")
+    with (
+        pytest.raises(OSError),
+        output.together([tmp_path / "new" / "deep" / name for name in ("a.exr", "a.json")]),
+        output.replacing(tmp_path / "new" / "deep" / "a.exr") as file,
+    ):
+        file.write_text("half")
+        raise OSError(28, "No space left on device")
     with pytest.raises(OSError, match="no reason of ours"), output.replacing(tmp_path / "a.txt"):
         raise OSError("no reason of ours")
     assert not list(tmp_path.iterdir())
