@@ -413,6 +413,7 @@ system_gain = 0.05
 dark_noise = 1.0
 black_level = 2.0
 saturation = 255.0
+prnu = 0.01
 """
 PLAIN = {
     "loops": "n = 0\nfor i in range(20_000_000): n += i * i",
