@@ -362,6 +362,7 @@ def _fit_at(descent: Descent, history: list[float], reason: str, start: np.ndarr
     """The fit that a descent has come to, linearised there."""
     variables, normal, theta = descent.variables, descent.here, _turned_back(descent)
     covariance = covariance_of(normal.a)
+    best = theta + np.where(np.isfinite(covariance), covariance, 0.0) @ normal.b  # of the linearisation, bounds or not
     # of variables with priors, the degrees of freedom that these and not the data hold: sum of c_ii/sd_i^2
     held = sum(
         float(np.clip(c * v.precision, 0.0, 1.0)) for v, c in zip(variables, np.diag(covariance)) if v.precision > 0
@@ -382,10 +383,10 @@ def _fit_at(descent: Descent, history: list[float], reason: str, start: np.ndarr
         start=start,
         at_bound=[
             v.name
-            for v, t, lo, hi, sd, best in zip(
-                variables, theta, descent.low, descent.high, np.sqrt(np.diag(covariance)), theta + covariance @ normal.b
+            for v, t, lo, hi, sd, to in zip(
+                variables, theta, descent.low, descent.high, np.sqrt(np.diag(covariance)), best
             )
-            if t <= lo or t >= hi or (v.parameter.factor and sd < np.inf and (t < OFF * sd or best <= lo))
+            if t <= lo or t >= hi or (v.parameter.factor and sd < np.inf and (t < OFF * sd or to <= lo))
         ],
         normal=normal,
     )

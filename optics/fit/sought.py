@@ -4,7 +4,9 @@ What hides a bead is nearer to the camera, and so is what shades it from lights 
 found first: a ball is tried at every pixel and depth, painted with the shadows of those that are known
 (`optics.fit.painted`), and taken where it explains the image much better than what is there: by its size, and by how
 its light falls to its rim. All balls found so far are fitted together, the scene itself rendering them; then those
-behind them are sought in what is left, with less asked of each. Balls that explain nothing any more go.
+behind them are sought in what is left, with less asked of each. Balls that explain nothing any more go, and before less
+is asked those that are far off where they are seen: a ball that stands for several others is, a right one is not. At
+last such balls are taken as well, and called doubtful.
 
     points, values = Seeker(reopen, "beads", frames, (0.4, 4.1), variables, Values()).seek()       (N, 3) mm
 """
@@ -40,7 +42,9 @@ SAME = 0.6  # diameters: two so near are one
 NEAR_BALLS = 0.99  # quantile of an image that balls near the camera show
 FEW = 0.03  # of the balls, found in a sweep: then less is asked
 LATER = 4  # where STRICT goes on from, once all balls were fitted
-SWEEPS, SETTLE = 40, 6  # at most; steps of the fit after each
+DOUBTFUL = 1.0  # mean of log(1 + chi2) where a ball is seen, from which on it is in doubt: noise alone has .53
+ELSEWHERE = 0.2  # diameters, from the place of a ball that was in doubt
+SWEEPS, SETTLE, AFTER = 40, 6, 2  # at most; steps of the fit after each, and without those in doubt
 ROOM = 1.0  # px beyond an outline that a step of a difference changes
 CHUNK = 4000  # places at a time
 
@@ -173,12 +177,19 @@ class Painted(_Problem):
 @dataclass
 class Found:
     """What is known between sweeps: (N, 3) mm, values, of each view (P, C) light that is predicted, and (P,) mm, how
-    near each pixel's nearest ball is."""
+    near each pixel's nearest ball is; (N,) how far off each ball is where it is seen."""
 
     points: np.ndarray
     values: Values
     shown: list[np.ndarray]
     near: np.ndarray
+    off: np.ndarray
+
+
+def in_doubt(off: np.ndarray) -> np.ndarray:
+    """Which balls are far off where they are seen: more than noise, and than twice the others, as a scene may be wrong
+    everywhere."""
+    return off > max(DOUBTFUL, 2 * float(np.median(off))) if len(off) else np.zeros(0, bool)
 
 
 class Seeker:
@@ -211,6 +222,7 @@ class Seeker:
         self.views = [self._view(f) for f in frames]
         self._level(variables(model))
         self.levels = self._levels()
+        self.refuted = np.zeros((0, 3))  # places of balls that were in doubt
         height, width = model.shape[:2]
         middle = at_depth(model, np.array([[width / 2, height / 2]]), np.array([sum(depths) / 2]))
         wide = outline(model, middle, np.array([self.diameter / 2]))
@@ -278,22 +290,45 @@ class Seeker:
         points, values   of balls that were found before, and fitted: those that go on explaining something stay as
                          they are, and what is left is asked less of from the first"""
         shown = [view.ground.reshape(-1, view.ground.shape[2]) for view in self.views]
-        found = Found(np.zeros((0, 3)), self.values, shown, np.full(len(shown[0]), np.inf))
-        grade = 0
-        if points is not None:
-            found, grade = self.settled(points, values or self.values, 0), LATER
+        if points is None:
+            nothing = Found(np.zeros((0, 3)), self.values, shown, np.full(len(shown[0]), np.inf), np.zeros(0))
+            found = self.swept(nothing, 0)
+        else:
+            found = self.swept(self.believed(self.settled(points, values or self.values, 0)), LATER)
+        found = self.swept(self.believed(found), LATER, doubt=False)
+        return found.points, found.values
+
+    def swept(self, found: Found, grade: int, doubt: bool = True) -> Found:
+        """What sweeps come to, from a grade of STRICT on.
+
+        doubt   whether balls that are in doubt go before less is asked, for others to be found in their place"""
+        self.refuted, doubted = np.zeros((0, 3)), not doubt
         for sweep in range(SWEEPS):
             if self.progress:
                 self.progress("beads", sweep, SWEEPS)
-            more = self.candidates(found, STRICT[grade])
-            before = len(found.points)
+            more, before = self.candidates(found, STRICT[grade]), len(found.points)
             if len(more):
                 found = self.settled(np.concatenate([found.points, more]), found.values)
-            if len(more) <= FEW * before:
-                grade += 1
-                if grade == len(STRICT):
-                    break
-        return found.points, found.values
+            if len(found.points) > (1 + FEW) * before:
+                continue
+            if not doubted:
+                before, found, doubted = len(found.points), self.believed(found), True
+                if len(found.points) < before:
+                    continue
+            grade += 1
+            self.refuted, doubted = np.zeros((0, 3)), not doubt
+            if grade == len(STRICT):
+                break
+        return found
+
+    def believed(self, found: Found) -> Found:
+        """What is left without balls that are in doubt: the worse half of them goes first, as a wrong ball makes its
+        neighbours doubtful. None is sought there again while as much is asked."""
+        while (doubtful := in_doubt(found.off)).any():
+            worse = found.off >= np.median(found.off[doubtful])
+            self.refuted = np.concatenate([self.refuted, found.points[worse]])
+            found = self.settled(found.points[~worse], found.values, AFTER)
+        return found
 
     def weigh(self, points: np.ndarray, found: Found, strict: float, shade: Sequence[np.ndarray] = ()) -> np.ndarray:
         """(M,) scores of balls at (M, 3) places in front of what is found: the fall of chi2, less `strict` times what
@@ -350,8 +385,11 @@ class Seeker:
         worth = excess[self.pixel] > 2.0 * values
         known = cKDTree(found.points) if len(found.points) else None
 
+        back = cKDTree(self.refuted) if len(self.refuted) else None
+
         def free(at: np.ndarray) -> np.ndarray:
-            return np.ones(len(at), bool) if known is None else known.query(at)[0] > TOUCH * self.diameter
+            apart = np.ones(len(at), bool) if known is None else known.query(at)[0] > TOUCH * self.diameter
+            return apart if back is None else apart & (back.query(at)[0] > ELSEWHERE * self.diameter)
 
         at = self.grid[worth].reshape(-1, 3)
         at = at[free(at)] if len(at) else at
@@ -418,9 +456,35 @@ class Seeker:
         for view, painting in zip(self.views, paintings):
             seen = painting.dim * dims(painting.shown, view.image, len(points), samples)
             view.glow = view.glow.times(float(np.median(seen)))
-        black = self.model.noise.black_level
-        shown = [(p - black).reshape(-1, p.shape[2]) for p in predictions]
-        return Found(points, values, shown, paintings[0].shown.near.reshape(-1, samples).min(1))
+        shown = self._shown(predictions)
+        near = paintings[0].shown.near.reshape(-1, samples).min(1)
+        return Found(points, values, shown, near, self.misfit(paintings, shown, len(points)))
+
+    def doubtful(self, points: np.ndarray, values: Values) -> np.ndarray:
+        """(N,) whether a ball is far off in the pixels that show it."""
+        problem = self._problem(points)
+        predictions, _ = problem.residual(points, values)
+        paintings = problem.painting(points, values, predictions)
+        return in_doubt(self.misfit(paintings, self._shown(predictions), len(points)))
+
+    def _shown(self, predictions: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Of each view (P, C) predicted light."""
+        return [(p - self.model.noise.black_level).reshape(-1, p.shape[2]) for p in predictions]
+
+    def misfit(self, paintings: Sequence[Painting], shown: Sequence[np.ndarray], count: int) -> np.ndarray:
+        """(N,) mean of log(1 + chi2) over the values in which each ball is the nearest: a pixel that is far off does
+        not count for many."""
+        samples = self.canvases[0].side ** 2
+        above, below = np.zeros(count), np.zeros(count)
+        for view, painting, p in zip(self.views, paintings, shown):
+            y, used = view.image.reshape(p.shape), view.used.reshape(p.shape)
+            each = used * np.log1p((y - p) ** 2 / self._variance(y, p))
+            first = painting.shown.first.reshape(-1, samples)
+            ball = np.where(first >= 0, first, count)
+            for k in range(samples):
+                above += np.bincount(ball[:, k], each.sum(1), count + 1)[:count]
+                below += np.bincount(ball[:, k], used.sum(1), count + 1)[:count]
+        return above / np.maximum(below, 1)
 
     def needed(
         self, paintings: Sequence[Painting], points: np.ndarray, predictions: Sequence[np.ndarray]

@@ -39,12 +39,14 @@ class Located:
 
     file     the table of places;   fit   optics.fit.bodies.Bodies
     found    number of beads in the image at rest;   added   those that the residual showed
+    doubtful   (N,) whether a bead is far off where it is seen
     """
 
     file: Path
     fit: Bodies
     found: int
     added: int
+    doubtful: np.ndarray
 
     def record(self) -> dict:
         """What goes to the .json beside the table."""
@@ -55,6 +57,7 @@ class Located:
             "added": self.added,
             "chi2": fit.chi2,
             "dof": fit.dof,
+            "doubtful": np.flatnonzero(self.doubtful).tolist(),
             "errors": np.round(fit.errors, 6).tolist(),
             "parameters": {v.name: [fit.values.common[v.name], float(sd)] for v, sd in zip(fit.variables, fit.sd)},
         }
@@ -66,6 +69,11 @@ class Located:
             f"{len(fit.points)} beads: {self.found} in the image at rest, {self.added} in what was left",
             f"chi2/dof {fit.chi2 / fit.dof:.3f}; errors in the median {across:.3g} mm across, {deep:.3g} mm in depth",
         ]
+        if self.doubtful.any():
+            lines.append(
+                f"warning: {self.doubtful.sum()} beads are far off where they are seen, and may be wrong; "
+                f"{self.file.with_suffix('.json').name} lists their rows under `doubtful`"
+            )
         if fit.chi2 > AMISS * fit.dof:
             lines.append(
                 "warning: the fit does not explain the images. Some positions or the scene are wrong: give more "
@@ -141,7 +149,7 @@ def _located(
     if fit.chi2 < AMISS * fit.dof:  # none is missing: all pixels count by their noise
         fit = refine(model, name, solved_for(model), values, depth_prior=seeker.prior, progress=progress)
     write_places(file, fit.points)
-    located = Located(file, fit, found, len(fit.points) - found)
+    located = Located(file, fit, found, len(fit.points) - found, seeker.doubtful(fit.points, fit.values))
     write_text(file.with_suffix(".json"), json.dumps(located.record(), indent=1))
     return located
 

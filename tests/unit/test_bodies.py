@@ -186,6 +186,8 @@ def test_beads_that_overlap_are_found_one_behind_the_other(mitsuba, tmp_path):
     points, values = seeker.seek()
     apart = np.linalg.norm(points[:, None] - maker.rest()[None], axis=-1)
     assert (apart.min(0) < 0.1).sum() >= 32
+    believed = ~seeker.doubtful(points, values)
+    assert (apart.min(1)[believed] > 0.3).sum() <= 1 and believed.sum() >= 32
     assert (apart.min(1) > 0.3).sum() <= 0.2 * len(points)
     for name, true in powers.items():
         assert values.common[name] == pytest.approx(true, rel=0.02)
