@@ -456,7 +456,7 @@ def _check_black(captures: Captures, used: Sequence[tuple[str, np.ndarray]], whe
     )
     if captures.bits and middle <= 0:
         raise BadCapture(f"{where}: {text}; allowed: {least:.4g} DN or more; correct [noise] black_level")
-    others = f" (so are {len(sunk) - 1} other frames)" if len(sunk) > 1 else ""
+    others = f"; {len(sunk) - 1} other frames are as dark" if len(sunk) > 1 else ""
     captures.warnings.append(f"{text}{others}: either [noise] black_level is too high, or the camera has a dark offset")
 
 

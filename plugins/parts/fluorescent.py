@@ -30,6 +30,7 @@ import math
 
 from optics.scene.checking import agree, made
 from optics.scene.declare import Part
+from optics.scene.line import of_part
 from optics.scene.parameter import Parameter
 from optics.scene.surfaces import matt
 
@@ -117,7 +118,7 @@ def build():
             lamp, measured = led.curves.get("spectrum"), self.curves.get("excitation_spectrum")
             form = led.curves.get("line_form")
             s1, s2 = led.fwhm / WIDTH, self.absorption_fwhm / WIDTH
-            area = math.sqrt(2 * math.pi) * s1
+            area = of_part(led, led).area
             if lamp is None and measured is None and form is None:
                 square = dr.square(s1) + dr.square(s2)
                 middle = (led.wavelength * dr.square(s2) + self.absorption_peak * dr.square(s1)) / square
@@ -126,12 +127,11 @@ def build():
             if form is not None:
                 scale = led.fwhm / form.fwhm
                 rule = [(led.wavelength + (x - form.peak) * scale, w * scale) for x, w in gauss_rule(form)]
-                area = form.area / float(form.values.max()) * scale
             elif lamp is None:
                 x, w = np.polynomial.hermite.hermgauss(NODES)
                 rule = [(led.wavelength + math.sqrt(2) * s1 * x, math.sqrt(2) * s1 * w) for x, w in zip(x, w)]
             else:
-                rule, area = gauss_rule(lamp), lamp.area / float(lamp.values.max())
+                rule = gauss_rule(lamp)
             total = mi.Float(0.0)
             for nm, weight in rule:
                 if measured is not None:

@@ -99,6 +99,16 @@ def test_a_table_that_is_none_is_refused(tmp_path, text, said):
     assert said in str(error.value)
 
 
+def test_a_bead_is_in_doubt_by_noise_and_by_the_others():
+    """Twice what noise leaves, and twice what others leave where a scene is wrong everywhere."""
+    from optics.fit.sought import in_doubt
+
+    assert in_doubt(np.array([0.5, 0.53, 0.6, 1.2])).tolist() == [False, False, False, True]
+    assert in_doubt(np.array([0.1, 0.1, 0.3])).tolist() == [False] * 3
+    assert in_doubt(np.array([2.0, 2.1, 2.5, 4.7])).tolist() == [False, False, False, True]
+    assert in_doubt(np.zeros(0)).tolist() == []
+
+
 @pytest.fixture
 def fourteen(mitsuba):
     """Beads by the numpy maker, at rest and under one press: true values, true places, and a model of any table."""
