@@ -24,11 +24,11 @@ def records(scene: Scene) -> list[dict[str, Any]]:
             continue
         peak = values.get(f"{name}.wavelength", 0.0)
         law = f"gaussian({peak:g}, {values[f'{name}.fwhm']:g})" if peak else "white"
-        if peak and (form := part.curves.get("line_form")) is not None:
-            law = f"peak {peak:g}, fwhm {values[f'{name}.fwhm']:.3g}; its form: {form.source}"
+        if peak and (form := part.curves.get("line_shape")) is not None:
+            law = f"peak {peak:g}, fwhm {values[f'{name}.fwhm']:.3g}; its shape: {form.source}"
         found.append({"key": f"{name}.spectrum", "kind": "power", "source": law, "span": None, "centre": peak or None})
     for key, curve in scene.curves.items():
-        if key.endswith(".line_form"):
+        if key.endswith(".line_shape"):
             continue
         found.append(
             {

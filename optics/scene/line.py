@@ -89,7 +89,7 @@ def relative(own, curve=None, form=None) -> Spectrum:
 
 def of_part(part, own) -> Spectrum:
     """The spectrum of a light, at its numbers `own`, by the curves that it was given."""
-    return relative(own, part.curves.get("spectrum"), part.curves.get("line_form"))
+    return relative(own, part.curves.get("spectrum"), part.curves.get("line_shape"))
 
 
 def changed(base: Spectrum, functions: Sequence[Callable], own) -> Spectrum:

@@ -116,7 +116,7 @@ def build():
         def overlap(self, led):
             """int w a l dl of an LED with the peak 1, and the area of its spectrum, nm."""
             lamp, measured = led.curves.get("spectrum"), self.curves.get("excitation_spectrum")
-            form = led.curves.get("line_form")
+            form = led.curves.get("line_shape")
             s1, s2 = led.fwhm / WIDTH, self.absorption_fwhm / WIDTH
             area = of_part(led, led).area
             if lamp is None and measured is None and form is None:

@@ -26,7 +26,7 @@ XML
     placed string: FILE:DESIGNATOR of a pick-and-place file, for x and y on the board, mm
     spectrum string: measured power over the wavelength, in place of the Gaussian: a file, a name, a law, or a spectrum
         of Mitsuba's (see "Spectra" in the guide); relative to its peak, of channels as integrals to its area
-    line_form string: the form of the line, in place of a Gaussian: a measured spectrum as of `spectrum`, which is moved
+    line_shape string: shape of the line, in place of a Gaussian: a measured spectrum as of `spectrum`, which is moved
         to `wavelength` and stretched to `fwhm`; these are its own where they are not given
 """
 
@@ -172,14 +172,14 @@ def build():
                     props[name] = value
             self.declare(props)
             self.read_spectrum(props, "spectrum", "power")
-            form = self.read_spectrum(props, "line_form", "power")
+            form = self.read_spectrum(props, "line_shape", "power")
             if form is not None and "spectrum" in self.curves:
                 raise BadScene(
-                    f"led '{self.name}': 'spectrum' and 'line_form' are both given; allowed: a spectrum as it is, or "
-                    "the form of a line, which 'wavelength' and 'fwhm' place"
+                    f"led '{self.name}': 'spectrum' and 'line_shape' are both given; allowed: a spectrum as it is, or "
+                    "the shape of a line, which 'wavelength' and 'fwhm' place"
                 )
             if form is not None:
-                self.curves["line_form"] = form = replace(form, cubic=True)
+                self.curves["line_shape"] = form = replace(form, cubic=True)
                 for number, found in (("wavelength", form.peak), ("fwhm", form.fwhm)):
                     if number not in props:
                         self.hold(number, found)

@@ -17,7 +17,7 @@ XML
     target point, (0, 0, 0): what its axis looks at, mm
     count integer, 8: number n of LEDs
     spectrum string: measured power over the wavelength, as of the part `led`
-    line_form string: measured form of the line, as of the part `led`
+    line_shape string: measured shape of the line, as of the part `led`
     board string: id of the part `board` that it stands on, as of the part `led`
     placed string: FILE:DESIGNATOR of a pick-and-place file, as of the part `led`
 """

@@ -27,7 +27,7 @@ XML
     target point, (0, 0, 0): what it faces, mm: the axis is from the position to here
     along vector: the direction of its long side, as far as that lies across the axis
     spectrum string: measured power over the wavelength, as of the part `led`
-    line_form string: measured form of the line, as of the part `led`
+    line_shape string: measured shape of the line, as of the part `led`
     board string: id of the part `board` that it stands on, as of the part `led`
     placed string: FILE:DESIGNATOR of a pick-and-place file, as of the part `led`
     points integer, 0: number n of points, a multiple of 4; 0: by its size

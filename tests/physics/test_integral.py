@@ -29,7 +29,7 @@ def digit(mitsuba, folder, bands, **attributes):
     """DIGIT with other bands; attributes of LEDs in XML as {led_red: '<...>'}."""
     text = (shipped("scenes") / "digit.xml").read_text(encoding="utf-8")
     if any('"spectrum"' in xml for xml in attributes.values()):
-        text = re.sub(r'<string name="line_form"[^>]*>', "", text)
+        text = re.sub(r'<string name="line_shape"[^>]*>', "", text)
     for part, xml in attributes.items():
         text = re.sub(rf'(<(?:emitter|sensor|bsdf) type="\w+" id="{part}">)', rf"\1 {xml}", text)
     file = folder / f"digit_{len(list(folder.iterdir()))}.xml"
@@ -45,7 +45,7 @@ def test_lines_give_what_bands_at_their_peaks_give(mitsuba, tmp_path):
     for bands in ("625, 530, 470", "auto"):
         text = (shipped("scenes") / "digit.xml").read_text(encoding="utf-8")
         text = re.sub(r'name="fwhm" value="[^"]+"', 'name="fwhm" value="1"', text)
-        text = re.sub(r'<string name="line_form"[^>]*>', "", text)  # Gaussians: measured lines have long flanks
+        text = re.sub(r'<string name="line_shape"[^>]*>', "", text)  # Gaussians: measured lines have long flanks
         file = tmp_path / "lines.xml"
         file.write_text(text, encoding="utf-8")
         images.append(RenderJob(loader.load(file, {**SIZE, "bands": bands})).take().camera)
@@ -189,7 +189,7 @@ def test_a_measured_line_is_moved_and_stretched(mitsuba, tmp_path):
         '<scene version="3.0.0"><integrator type="tactile" id="integrator"><string name="bands" value="BANDS"/>'
         f'</integrator><sensor type="camera" id="camera"><string name="sensitivity" value="{NIKON}"/></sensor>'
         '<shape type="rectangle" id="floor"><bsdf type="membrane" id="paint"/></shape>'
-        '<emitter type="led" id="led"><string name="line_form" value="led_ingan_518.csv"/>PLACE</emitter></scene>'
+        '<emitter type="led" id="led"><string name="line_shape" value="led_ingan_518.csv"/>PLACE</emitter></scene>'
     )
 
     def loaded(bands, place):
@@ -214,7 +214,7 @@ def test_a_measured_line_is_moved_and_stretched(mitsuba, tmp_path):
             found = integral.matrix(values) @ integral.spectrum("led", values)[::4] * integral.unit
         assert found == pytest.approx(expected, abs=1e-3 * expected.max())  # cubics for straight lines: 5e-4
     both = place + '<string name="spectrum" value="gaussian(530, 30)"/>'
-    with pytest.raises(BadScene, match="'spectrum' and 'line_form' are both given; allowed"):
+    with pytest.raises(BadScene, match="'spectrum' and 'line_shape' are both given; allowed"):
         loaded("auto", both)
 
 
@@ -325,7 +325,7 @@ def test_pigments_and_ultraviolet_leds_are_given_by_curves(mitsuba, tmp_path):
     assert curves.count("LAMP") == 2 and "emission_spectrum" in curves
     (tmp_path / "curves.xml").write_text(curves.replace("LAMP", "gaussian(275, 11)"), encoding="utf-8")
     (tmp_path / "far.xml").write_text(curves.replace("LAMP", "gaussian(900, 11)"), encoding="utf-8")
-    formed = curves.replace('"spectrum" value="LAMP"', '"line_form" value="gaussian(300, 20)"')  # moved to 275, 11 nm
+    formed = curves.replace('"spectrum" value="LAMP"', '"line_shape" value="gaussian(300, 20)"')  # moved to 275, 11 nm
     (tmp_path / "formed.xml").write_text(formed, encoding="utf-8")
     small = {"width": "32", "height": "24", "x_fov": "60", "sensitivity": NIKON, "analyzer": "90"}
     for bands in ("auto", "620, 540, 460"):

@@ -133,7 +133,7 @@ def test_spectra_are_listed_and_drawn(optics, tmp_path):
     code, text, _ = optics("params", *auto)
     assert (
         code == 0
-        and "peak 625, fwhm 14.8; its form: led_algainp_633.csv" in text
+        and "peak 625, fwhm 14.8; its shape: led_algainp_633.csv" in text
         and "Nikon 5100" in text
         and "estimated error" in text
     )

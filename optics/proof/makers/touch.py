@@ -85,7 +85,7 @@ class Maker:
         self.frames = {
             n: np.array([[float(c[0]) for c in axis] for axis in led.frame]) for n, led in scene.leds.items()
         }
-        self.lines = {n: led.curves["line_form"] for n, led in scene.leds.items() if "line_form" in led.curves}
+        self.lines = {n: led.curves["line_shape"] for n, led in scene.leds.items() if "line_shape" in led.curves}
         self.effects = dict(effects or {})
         unknown = set(self.effects) - set(MAKERS)
         if unknown:
