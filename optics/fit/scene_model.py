@@ -620,14 +620,12 @@ class SceneModel:
                 np.imag(self.renderer.radiance({**now, key: now[key] + 1j * STEP}, seed, component)) / STEP
             )
         if key == self.renderer.bounce_key:
-            return (
-                factor
-                * sum(
-                    power * self.renderer.bounced(now, led, seed, component, self.renderer.rough)
-                    for led, power in lit.items()
-                )
-                if lit
-                else None
+            if not lit:
+                return None
+            # of light that the model does not have yet, a ranking asks for the image: fewer directions will do
+            rough = self.renderer.rough or not now[key]
+            return factor * sum(
+                power * self.renderer.bounced(now, led, seed, component, rough) for led, power in lit.items()
             )
         if self._is_power(key):
             if np.all(factor == 0):

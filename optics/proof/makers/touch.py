@@ -246,9 +246,8 @@ class Maker:
         params.update()
         self.count += 1
         integrator = mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": 1000})
-        return np.array(mi.render(scene, integrator=integrator, spp=self.spp, seed=self.seed * 100003 + self.count))[
-            ..., 0
-        ]
+        seed = (self.seed * 100003 + self.count) % 2**32
+        return np.array(mi.render(scene, integrator=integrator, spp=self.spp, seed=seed))[..., 0]
 
     def light(self, press: Sequence[float]) -> dict[str, np.ndarray]:
         """{LED: (H, W, 3) radiance at power 1}, and under 'ambient' what no LED made."""
