@@ -18,7 +18,7 @@ from optics.diagnosis.evidence import Candidate, Evidence, at_bound
 from optics.diagnosis.explanations import Outcome, beside_noise, fall_over_noise, lead_without
 from optics.diagnosis.refit import Case, clear
 from optics.diagnosis.result import Basis, Fingerprint, Law, Level, Split
-from optics.diagnosis.thresholds import AS_GOOD, LEVEL, MISSTATED, TOLD, UNEVEN
+from optics.diagnosis.thresholds import AS_GOOD, DETAIL, HIDDEN, LEVEL, MISSTATED, TOLD, UNEVEN
 from optics.fit.compare import led_label
 from optics.fit.model import Model, value_of
 from optics.fit.result import Fit
@@ -128,7 +128,7 @@ def findings_of(
         complete,
         complete or case.evidence.is_table,
     )
-    better = [followed] if followed else rivals(fingerprints, opponent)
+    better = [followed] if followed else [] if _is_detail(own) else rivals(fingerprints, opponent)
     # beside noise that explains most, a curve of something else may seem to do better than an effect
     better = [f for f in better if whole[f.coordinate] >= AS_GOOD * own.fall]
     best_curve = better[0] if better else fingerprints[0]
@@ -141,6 +141,11 @@ def findings_of(
         coordinate=best_curve.coordinate,
         curve_share=best_curve.share,
     )
+
+
+def _is_detail(own: Findings) -> bool:
+    """Whether what the best explanation leaves is surely less than DETAIL of the excess."""
+    return own.weighed and 1 - own.share + HIDDEN / own.excess_sd < DETAIL
 
 
 def law_lead(case: Case, outcome: Outcome, score: float) -> float:

@@ -383,8 +383,9 @@ def unexplained(found: Sequence[Fingerprint], best_effect: float, excess: float)
     if not excess > 0 or best is None:
         return ""
     effect, curve = (min(max(x / excess, 0.0), 1.0) for x in (best_effect, best.net))
-    return (
-        f"The best effect explains {effect:.0%} of the excess misfit, so the library leaves {1 - effect:.0%} "
-        f"unexplained. The best curve, along '{best.coordinate}', explains {curve:.0%}. Neither of them explains "
-        f"{1 - max(effect, curve):.0%}."
+    text = (
+        f"The best effect explains {effect:.0%} of the excess misfit, the best curve, along '{best.coordinate}', "
+        f"{curve:.0%}."
     )
+    rest = f"{1 - max(effect, curve):.0%}"
+    return text if rest == "0%" else f"{text} Neither of them explains the other {rest}."

@@ -1,5 +1,6 @@
 """What tells explanations apart: the form of an image, what is known of dials, predictions of blocks left out."""
 
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -451,3 +452,15 @@ def test_effects_that_predict_the_same_are_not_told_apart_whatever_their_slopes_
     gaps, correct = diagnose._gaps(case, outcome, [a, b, c])
     assert gaps == [[0.0, pytest.approx(3.5), 400.0], [0.0, 0.0, 400.0], [400.0, 400.0, 0.0]]
     assert correct[0][1] == pytest.approx(st.probability_correct(3.5)) and correct[1][0] == 0.5
+
+
+@pytest.mark.parametrize(
+    "share, excess_sd, detail", [(1.0002, 792.0, True), (0.995, 500.0, True), (1.2, 5.2, False), (0.98, 2400.0, False)]
+)
+def test_what_is_surely_a_hundredth_of_the_excess_is_a_detail(share, excess_sd, detail):
+    """Light past the films, partly polarized, of which plain stray light leaves .0 +- .1 % of an excess of 792 sd: no
+    curve is a rival. Of an excess of 5 sd, what is left is not known to a fifth."""
+    own = SimpleNamespace(share=share, excess_sd=excess_sd, weighed=True)
+    assert findings._is_detail(own) is detail
+    assert not findings._is_detail(SimpleNamespace(share=math.nan, excess_sd=792.0, weighed=True))
+    assert not findings._is_detail(SimpleNamespace(share=share, excess_sd=excess_sd, weighed=False))
