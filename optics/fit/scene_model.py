@@ -427,8 +427,9 @@ class SceneModel:
         """Per frame: prediction (H, W, C) in DN and {variable's name: d prediction / d value}, float32.
 
         `secant` gives, by name, a finite step to take from the present value in place of the tangent. Variables that do
-        nothing in a frame are left out of its dictionary. Of a crowded scene, the images of another seed than the
-        predictions' are made of fewer samples, and so is the prediction that comes with them."""
+        nothing in a frame are left out of its dictionary. Of another seed than the predictions', images are made of
+        fewer samples: those of light reflected twice where the model has none yet, and all of a crowded scene, whose
+        prediction that comes with them is rough as well."""
         self.check_variables(variables)
         yield from self._made(
             frames, _differentiated, values=values, variables=variables, secant=secant or {}, seed=seed
@@ -622,8 +623,8 @@ class SceneModel:
         if key == self.renderer.bounce_key:
             if not lit:
                 return None
-            # of light that the model does not have yet, a ranking asks for the image: fewer directions will do
-            rough = self.renderer.rough or not now[key]
+            # of light that the model does not have yet, a ranking needs but a rough image, twice
+            rough = self.renderer.rough or (seed != 0 and not now[key])
             return factor * sum(
                 power * self.renderer.bounced(now, led, seed, component, rough) for led, power in lit.items()
             )
