@@ -144,7 +144,8 @@ def findings_of(
 
 
 def _is_detail(own: Findings) -> bool:
-    """Whether what the best explanation leaves is surely less than DETAIL of the excess."""
+    """Whether the best explanation leaves less than DETAIL of the excess, by HIDDEN standard deviations of the share,
+    each 1/excess_sd."""
     return own.weighed and 1 - own.share + HIDDEN / own.excess_sd < DETAIL
 
 
