@@ -26,8 +26,8 @@ RIVAL = 1.5
 # The same for a curve along one coordinate. With a true effect it gains only what clutter adds: 1.02 was measured, and
 # 1.2 with a false one.
 RIVAL_CURVE = 1.12
-# Share of the excess: where the best explanation leaves less, by HIDDEN standard deviations, what is left is a detail of
-# its law, and no curve is a rival. In 548 sets of strangers' benches this changes one verdict, to a right claim.
+# Share of the excess: where the best explanation leaves less, by HIDDEN standard deviations, what is left is a detail
+# of its law, and no curve is a rival. In 548 sets of strangers' benches this changes one verdict, to a right claim.
 DETAIL = 0.01
 SHARE = 0.05  # of the excess misfit that a claimed effect must explain ...
 EXCESS = 5.0  # ... where the excess is more than this many standard deviations

@@ -64,9 +64,9 @@ INDENTER_SIZE = 1.5  # mm
 # it from samples; a vignetting that is known to 0.08 % comes out 3.9 errors low at 0.06 mm, 1.1 at 0.03 mm and 0.6 at
 # 0.02 mm. A press takes a fifth longer than at 0.06 mm.
 PITCH = 0.03
-# Vertices beside the fine part, where the face is nearly flat, and in all, unless stated. With 48 beside it a gel bulge,
-# whose ring is wider than the fine part, came out 1.6 % higher in one set; with 24, images of a face of 0.2 m radius
-# are off by 8e-4 of their mean, with 80 by 1e-4.
+# Vertices beside the fine part, where the face is nearly flat, and in all, unless stated. With 48 a gel bulge, whose
+# ring is wider than the fine part, came out 1.6 % higher in one set; with 24, images of a face of 0.2 m radius are off
+# by 8e-4 of their mean, with 80 by 1e-4.
 BESIDE, MOST = 80, 2000
 DRAG = ("friction", "shift_x", "shift_y", "twist")
 SHEARING = ("poisson", *DRAG)

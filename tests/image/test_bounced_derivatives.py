@@ -42,3 +42,17 @@ def test_fewer_directions_leave_little_error(bench):
     directions, 0.055 of what leaving the second reflection out would bring; twice that is allowed."""
     alone, off = compared(bench, "membrane.sigma")
     assert off < 0.11 * alone
+
+
+@pytest.mark.parametrize("seed, share, rough", [(0, 0.0, False), (1001, 0.0, True), (1001, 0.5, False)])
+def test_a_ranking_asks_for_fewer_directions(seed, share, rough, bench, monkeypatch):
+    """With a seed of its own, of light that the model does not have yet; a fit has those of its predictions."""
+    asked, key = [], "integrator.interreflection"
+
+    def bounced(values, led, seed, component, roughly):
+        asked.append(roughly)
+        return np.zeros((1, 1, 3))
+
+    monkeypatch.setattr(bench.model.renderer, "bounced", bounced)
+    bench.model._component_tangent({**bench.values, key: share}, key, 1.0, seed, False, 0)
+    assert asked and set(asked) == {rough}
