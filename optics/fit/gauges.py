@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optics.fit.model import Model
-from optics.scene.parameter import Parameter, Variable, beside
+from optics.scene.parameter import Parameter, Variable, beside, keys_with
 from optics.words import some, spaced, with_sd
 
 if TYPE_CHECKING:
@@ -210,7 +210,9 @@ def _acts(model: Model, key: str) -> bool:
     through = parameters[key].through
     if not through:
         return True
-    return len({float(x) for part in _set(model, f"{key.rpartition('.')[0]}.{through}") for x in np.ravel(part)}) > 1
+    own = f"{key.rpartition('.')[0]}.{through}"
+    seen = [own] if own in parameters else keys_with(parameters, through)
+    return any(len({float(x) for part in _set(model, k) for x in np.ravel(part)}) > 1 for k in seen)
 
 
 def _set(model: Model, key: str) -> list:

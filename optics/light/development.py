@@ -100,6 +100,7 @@ class Developer:
         height (px); side, parts of a pixel each way that the image has, for effects that are `finer`; astray() (H, W)
         px by which a ray off the pupil's middle misses the chief ray, per mm off it, at the distance that the pixel
         sees; bands (nm);
+        time, the scene's clock, 0 without one, (N, 1, 1) where readings were swept;
         white (B,) radiance per band of white light of radiance 1; settings: all values by key, those of
         other parts too, (N, 1, 1) where readings were swept."""
         own = {n: values[f"{self.name}.{n}"] for n in self.names}
@@ -129,6 +130,7 @@ class Developer:
             white=np.ones(len(self.bands)) if self.integral is None else self.integral.white,
             site=self.site,
             settings=values,
+            time=values.get(self.camera.clock, 0.0),
         )
 
     def side(self, values: Mapping[str, complex]) -> int:

@@ -79,9 +79,9 @@ class Parameter:
     period      change that makes no difference: half a turn of a film's zero; a fit ends within half of it from neutral
     pair        name of the part's parameter that is the other component of the same vector; `starts` are then its
                 lengths, each taken in eight directions
-    through     name of the part's setting through whose changes alone it shows: where that has one value in all frames,
-                it acts as other parameters do (a wobble as a transmittance, a scale as an offset), and no effect frees
-                it there
+    through     name of the part's setting, or 'clock' for the scene's, through whose changes alone it shows: where
+                that has one value in all frames, it acts as other parameters do (a wobble as a transmittance, a scale
+                as an offset), and no effect frees it there
     role        what it is to the library, one of ROLES; '' for what only the part itself and effects read
     band        number of the spectral band that it belongs to, from 0; None: of all bands
     free        what a calibration solves for unless its setup says otherwise: 'all' (one value for all frames), 'press'

@@ -203,6 +203,7 @@ def build():
         kind = "camera"
         sampled = False  # whether images LED by LED are made of rays that start all over the pupil
         bands = 3  # of the scene
+        clock = ""  # key of the scene's clock
 
         def __init__(self, props):
             nominal = props.get("to_world", mi.ScalarAffineTransform4f())
@@ -240,11 +241,15 @@ def build():
 
         def wire(self, scene):
             self.bands = len(getattr(scene.integrator, "bands", ())) or 1
+            clocks = [f"{p.name}.{n}" for p in scene.parts for n, q in p.numbers.items() if q.role == "clock"]
+            self.clock = clocks[0] if clocks else ""
 
         def takes(self, name):
             idle = ["detector" if self.mosaic else "site"]  # behind an analyser a pixel meets one polarization
             if self.bands == 1 and self.integral is None:  # of one band a sensitivity is a gain
                 idle.append("sensitivity")
+            if not self.clock and self.numbers[name].through == "clock":
+                return False
             return not any(
                 name in effect.parameter_names for stage in idle for effect in self.registry.at_stage(self.kind, stage)
             )

@@ -26,7 +26,7 @@ from optics.polarization.mueller import where
 from optics.scene.checking import agree, ray
 from optics.scene.checking import stokes as sent
 from optics.scene.declare import Part
-from optics.scene.lamp import drifted
+from optics.scene.warming import drifted
 from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
 from optics.scene.regions import FILES, PATTERNS, Regions

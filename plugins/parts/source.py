@@ -25,7 +25,7 @@ from dataclasses import replace
 from optics.scene.checking import agree, ray
 from optics.scene.checking import stokes as sent
 from optics.scene.declare import Part
-from optics.scene.lamp import drifted
+from optics.scene.warming import drifted
 from optics.scene.line import LINE, relative
 from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter

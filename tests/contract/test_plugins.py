@@ -122,6 +122,9 @@ SURROUNDINGS = {  # parameter: what has to stand about it for it to be seen, and
     **{f"strip.{name}": {"strip_red.phosphor_leak": 0.1} for name in ("die_wavelength", "die_width")},
     **{f"ring.{name}": {"inner_ring.phosphor_leak": 0.1} for name in ("die_wavelength", "die_width")},
     **{f"{kind}.settling": {f"{kind}.drift": 0.02, f"{kind}.time": 3.0} for kind in ("source", "panel")},
+    # the clock of the first scene whose camera has one
+    "camera.dark_drift": {"source.time": 3.0},
+    "camera.dark_settling": {"source.time": 3.0, "camera.dark_drift": 2e-3},
     # the first direction of a carried film is constant in each triangle: a film that bends makes small jumps
     "gel.press_depth": {"film.inserted": 0.0},
     **{f"carried.{name}": {"skin.press_depth": 0.0} for name in ("width", "length", "depth")},

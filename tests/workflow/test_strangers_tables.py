@@ -160,3 +160,17 @@ def test_other_series_of_a_table_are_passed_over(tmp_path):
     file.write_text(text + 'ignore = ["other"]\n', encoding="utf-8")
     _, model, fit = loop.begin(setup_for(tmp_path / "captures"), tmp_path / "study")
     assert fit.converged and "other" not in model.frames[0].readings
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.2])
+def test_a_dark_signal_that_grows_by_the_clock_is_dark_drift(rate, tmp_path):
+    """Three half turns: 5 % of the largest reading more in the end, in the dark as in the light.
+    A detector that warms does so by a straight line or towards a balance."""
+    dial, time = np.tile(TURN, 3), np.arange(3 * len(TURN)) / 3.0
+    dark = 0.05 * (time / time[-1] if rate == 0 else 1 - np.exp(-rate * time))
+    columns = {"analyzer.angle": dial, "source.time": time}
+    found = judged(tmp_path, noisy(malus(dial) + dark), columns, 'absent = ["sample", "middle"]')
+    assert (found.word, found.claimed) == ("CLAIM", "dark drift"), found.sentence
+    own = next(e for e in found.explanations if e.effects == ["dark drift"])
+    slope = 0.05 / time[-1] if rate == 0 else 0.05 * rate
+    assert abs(own.strength[0] - slope) < 4 * own.sd[0] and own.sd[0] < 0.1 * slope

@@ -44,7 +44,6 @@ OTHER = {
     "polarized source": "half as much again at half the power, half as much at the whole",
     "extinction leak": "the analyser's is 1 + 0.6 cos psi of the mean: thinner on one side",
     "depolarization": "the beam meets 1.4 s at one angle of the sheet, 0.6 s at the other: cloudy in places",
-    "dark offset": "grows as the detector warms: s (1 - exp(-t/8 min))",
     "stray light": "1.3 s in one half of the analyser's turn, 0.7 s in the other",
     "source drift": "warms up, by as much in all: s T (1 - exp(-t/8 min))/(1 - exp(-T/8 min)) in T min, for s t",
 }
@@ -117,8 +116,6 @@ def other_light(effect: str, s: float, settings: jones.Settings, turned: np.ndar
     if effect == "depolarization":
         hazy = replace(plain, sample=jones.Sample(depolarization=1.0))
         return mixed(hazy, s * np.where(turn < 22.5, 1.4, 0.6))
-    if effect == "dark offset":
-        return lit() + s * warmed
     if effect == "stray light":
         return lit() + (lit(replace(plain, stray=s)) - lit()) * (1 + 0.3 * np.sign(np.sin(psi)))
     if effect == "source drift":

@@ -66,7 +66,8 @@ SAME: Mapping[str, Mapping[str, str]] = {
 SAME_BY_OTHER_LAW: Mapping[str, Mapping[str, str]] = {
     "residual response curve": {
         "soft saturation": "the other law is a straight line that levels off beyond a knee: what the library calls so"
-    }
+    },
+    "dark offset": {"dark drift": "the other law grows with the clock and settles: what the library calls so"},
 }
 IN_SAMPLE = {"retardance", "stress birefringence", "depolarization", "dichroic sample"}
 
