@@ -33,7 +33,7 @@ from optics.diagnosis.refit import Case, Cooled, Expected, after_at, refit_each
 from optics.diagnosis.result import Basis, Diagnosis, Family, Fingerprint, Row, Split, kinds_of
 from optics.diagnosis.score import score
 from optics.diagnosis.text import leaves_misfit, sentence
-from optics.diagnosis.thresholds import CLEAR, EXCESS, LEVEL, MAX_SPLIT, SHARE, close
+from optics.diagnosis.thresholds import CLEAR, EXCESS, LEVEL, MARGIN, MAX_SPLIT, SHARE, close
 from optics.errors import Underdetermined
 from optics.fit import calibrate
 from optics.fit.model import Model
@@ -158,6 +158,7 @@ def diagnose(
             again.warnings.append(cooled.remark)
             return again
     outcome, levels = held.judge(case, explanations.search(case, chosen, fits))
+    chosen += [c for c in table.order if c.effect.name in fits and c not in chosen]
     subject, best = subject_of(case, outcome), outcome.best
 
     reference = best.fall - best.expectation if subject else max([c.row.net for c in table.order], default=0.0)
@@ -230,7 +231,8 @@ def _best_first(case: Case, fits: Mapping[str, Fit]) -> list[Fit]:
 
 def _choose(case: Case, top: int, asked: Collection[str] = ()) -> list[Candidate]:
     """The effects to refit: those that cannot be told from the best by score; of a table all that stand out besides, as
-    its refits are cheap; of images the best of them, and winners of other weights.
+    its refits are cheap; of images the best of them, and winners of other weights. Where predictions are quick, those
+    whose image bends too: what crossed films show of a misalignment goes with its square, and its score says little.
 
     Where noise explains every effect, none is refitted."""
     seen = [c for c in case.table.order if c.row.net > 0]
@@ -243,7 +245,9 @@ def _choose(case: Case, top: int, asked: Collection[str] = ()) -> list[Candidate
     chosen = live[:top] + [c for c in near if c not in live[:top]]
     chosen = chosen[:MAX_REFITS]
     others = {*case.table.preferred.values(), *asked} - {c.effect.name for c in chosen}
-    return chosen + [c for c in live if c.effect.name in others]
+    near_enough = [c for c in live if case.model.quick and c.row.net > MARGIN * live[0].row.net]
+    bent = {c.effect.name for c in near_enough if c.effect.onset != "tangent"}
+    return chosen + [c for c in live if c.effect.name in others | bent and c not in chosen]
 
 
 def _split(case: Case, outcome: Outcome, subject: Candidate | None, basis: Basis) -> tuple[list[Split], float]:

@@ -40,7 +40,19 @@ from optics.diagnosis import homogeneity, pairs
 from optics.diagnosis import statistics as st
 from optics.diagnosis.correlation import NOTICED, SHORTEST, Correlation, Readings
 from optics.diagnosis.evidence import Candidate, at_bound, measure, priors, silent
-from optics.diagnosis.refit import FAILURES, START, Case, excess_of, from_there, known_of, weighed, with_effects
+from optics.diagnosis.refit import (
+    FAILURES,
+    START,
+    Case,
+    Expected,
+    clear,
+    excess_of,
+    from_there,
+    known_of,
+    weighed,
+    with_effects,
+    write,
+)
 from optics.diagnosis.result import Explanation, leaves_nothing
 from optics.diagnosis.score import solve
 from optics.diagnosis.session import Frames
@@ -295,17 +307,19 @@ def expected_cost(c: Candidate) -> float:
 def search(case: Case, chosen: Sequence[Candidate], fits: dict[str, Fit]) -> Outcome:
     """Refit the sets of effects that may explain the residual, and let them compete.
 
-    chosen   effects that were refitted one by one; fits: their fits
+    chosen   effects that were refitted one by one; fits: their fits, to which those that are found here are added
     """
     trials = _singly(case, chosen, fits)
     _expected(case, trials)
     if not case.evidence.is_table:
         untried = _joined(case, trials)
+        _within(case, trials, fits)
         return replace(compete(case, list(trials.values())), untried=untried)
     race = Race(case, trials)
     race.widen()
     for name in sorted(race.leader.names):
         race.widen(without=name)
+    _within(case, trials, fits)
     outcome = compete(case, list(trials.values()))
     if race.exchange([*outcome.survivors, *outcome.larger]):
         outcome = compete(case, list(trials.values()))
@@ -330,6 +344,34 @@ def _expected(case: Case, trials: dict[frozenset[str], Trial]) -> None:
         found = from_there(case, members, e)
         if found is not None:
             trials[e.names] = _trial(case, members, found)
+
+
+def _within(case: Case, trials: dict[frozenset[str], Trial], fits: dict[str, Fit]) -> None:
+    """Refit the sets within the best explanations from where these are, without an effect that they can do without.
+
+    The best effect may be one that no derivative of the base points to, and that is found beside another: of a plate of
+    50 degrees the base's images show the turn of a film, and beside that turn the plate, which explains all."""
+    scale = _scale(case, trials.values())
+    for t in sorted(trials.values(), key=lambda t: -_score(t, scale))[:LEADERS]:
+        for c in t.members if len(t.members) > 1 else []:
+            rest = [m for m in t.members if m is not c]
+            names = t.names - {c.effect.name}
+            loss = clear(t.fit, c, [value_of(case.model, t.fit.values, v) for v in c.variables]) ** 2
+            known = trials.get(names)
+            reached = known.fall if known is not None else -math.inf
+            if not loss < REACH * scale or t.fall - loss < reached + CLEAR * scale:
+                continue
+            start = t.fit.values.copy()
+            for v, at in zip(c.variables, c.start):
+                start.put(v, float(at))
+            found = from_there(case, rest, Expected(names, start))
+            made = None if found is None else _trial(case, rest, found)
+            if made is None or not made.fall > reached:
+                continue
+            trials[names] = made
+            if len(rest) == 1:
+                fits[rest[0].effect.name] = made.fit
+                write(case, rest[0], weighed(case, made.fit), rest[0].row.net)
 
 
 def _nothing(case: Case) -> Trial:
@@ -671,11 +713,11 @@ def compete(case: Case, trials: list[Trial]) -> Outcome:
             if i < CONTENDERS or len(t.members) < 2 or t.readings is not None:
                 t.gain = _readings(case, t).noise(scale).gain
                 t.deviance = _readings(case, t).standing(scale)
-        # whitened by what readings of one setting share, residuals are larger: of the others by as much as the base's
-        base = next(t for t in order if not t.members)
+        # whitened by what readings of one setting share, residuals are of another size: of the others by as much as
+        # those of the best, which are noise; of a base that misses much, that is another number
         for t in order:
             if t.readings is None:
-                t.deviance += (_readings(case, base).reached - base.after) / scale
+                t.deviance += (_readings(case, best).reached - best.after) / scale
         order.sort(key=lambda t: t.deviance + t.cost)
     elif case.lamp is not None:
         for t in order:

@@ -32,11 +32,11 @@ Where an effect enters, in the order that light takes (`STAGES`):
     response    camera    m  = f(image, camera)       response per channel, 1 = full scale; numpy
 
 `camera` has the camera's parameters, the geometry of its pixels (optics.light.development), in `time` the scene's
-clock, in `settings` all values by key, such as `analyzer.angle`; `site` (H, W) holds the analyser angle of each pixel of a mosaic, rad. Functions
-of the stages `lens`, `site` and `sensor` are affine in what they are given, those of `response` act pixel by pixel. All
-must be analytic (no abs, max or branches on their complex arguments): their derivatives are taken by complex step,
-exact to rounding (Squire & Trapp, SIAM Rev. 40, 110, 1998). An effect without functions frees parameters that its part
-has."""
+clock, in `settings` all values by key, such as `analyzer.angle`; `site` (H, W) holds the analyser angle of each pixel
+of a mosaic, rad. Functions of the stages `lens`, `site` and `sensor` are affine in what they are given, those of
+`response` act pixel by pixel. All must be analytic (no abs, max or branches on their complex arguments): their
+derivatives are taken by complex step, exact to rounding (Squire & Trapp, SIAM Rev. 40, 110, 1998). An effect without
+functions frees parameters that its part has."""
 
 from __future__ import annotations
 

@@ -26,10 +26,10 @@ from optics.polarization.mueller import where
 from optics.scene.checking import agree, ray
 from optics.scene.checking import stokes as sent
 from optics.scene.declare import Part
-from optics.scene.warming import drifted
 from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
 from optics.scene.regions import FILES, PATTERNS, Regions
+from optics.scene.warming import drifted
 
 REGIONS = 4
 PARAMETERS = (

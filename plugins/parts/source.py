@@ -25,10 +25,10 @@ from dataclasses import replace
 from optics.scene.checking import agree, ray
 from optics.scene.checking import stokes as sent
 from optics.scene.declare import Part
-from optics.scene.warming import drifted
 from optics.scene.line import LINE, relative
 from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
+from optics.scene.warming import drifted
 
 PARAMETERS = (
     Parameter(
