@@ -231,8 +231,8 @@ def _best_first(case: Case, fits: Mapping[str, Fit]) -> list[Fit]:
 
 def _choose(case: Case, top: int, asked: Collection[str] = ()) -> list[Candidate]:
     """The effects to refit: those that cannot be told from the best by score; of a table all that stand out besides, as
-    its refits are cheap; of images the best of them, and winners of other weights. Where predictions are quick, those
-    whose image bends too: what crossed films show of a misalignment goes with its square, and its score says little.
+    its refits are cheap; of images the best of them, winners of other weights, and those whose image bends: what
+    crossed films show of a misalignment goes with its square, and its score says little of what a refit reaches.
 
     Where noise explains every effect, none is refitted."""
     seen = [c for c in case.table.order if c.row.net > 0]
@@ -245,7 +245,7 @@ def _choose(case: Case, top: int, asked: Collection[str] = ()) -> list[Candidate
     chosen = live[:top] + [c for c in near if c not in live[:top]]
     chosen = chosen[:MAX_REFITS]
     others = {*case.table.preferred.values(), *asked} - {c.effect.name for c in chosen}
-    near_enough = [c for c in live if case.model.quick and c.row.net > MARGIN * live[0].row.net]
+    near_enough = [c for c in live if c.row.net > MARGIN * live[0].row.net]
     bent = {c.effect.name for c in near_enough if c.effect.onset != "tangent"}
     return chosen + [c for c in live if c.effect.name in others | bent and c not in chosen]
 

@@ -175,8 +175,8 @@ def _best_attempt(case: Case, c: Candidate, predicted: float, linear: np.ndarray
         found = weighed(case, refitted)
         if math.isfinite(found.after) and (best is None or found.fall > best.fall):
             best = found
-    if best is not None and case.model.quick and (size := _size(case, c, best.fit)) > IMPLAUSIBLE:
-        best = _nearer(case, c, linear, best, size)
+    if best is not None and any(math.isfinite(v.parameter.period) for v in c.variables):
+        best = _nearer(case, c, best)
     for e in case.expected:
         if e.names == {c.effect.name} and (best is None or after_at(case, e.values) < best.after - CLEAR):
             there = from_there(case, [c], e)
@@ -186,25 +186,24 @@ def _best_attempt(case: Case, c: Candidate, predicted: float, linear: np.ndarray
     return best
 
 
-def _size(case: Case, c: Candidate, found: Fit) -> float:
-    """The largest change of its strengths, in plausible sizes."""
-    return float(
-        max(abs(value_of(case.model, found.values, v) - at) / p for v, at, p in zip(c.variables, c.start, c.plausible))
-    )
+def _nearer(case: Case, c: Candidate, best: Attempt) -> Attempt:
+    """Of strengths that a period repeats, the refit that begins near neutral, if it explains as much with less: two
+    films that are both turned by a quarter let the same light pass."""
 
+    def sizes(found: Fit) -> np.ndarray:
+        return (np.array([value_of(case.model, found.values, v) for v in c.variables]) - c.start) / c.plausible
 
-def _nearer(case: Case, c: Candidate, linear: np.ndarray, best: Attempt, size: float) -> Attempt:
-    """The refit from a change of GUIDED plausible sizes, if it explains as much with less: two films that are both
-    turned by a quarter let the same light pass, and a start that shoots too far ends there."""
-    first = float(np.max(np.abs(c.change_of(linear)) / c.plausible))
-    if first * START <= GUIDED:
+    far = sizes(best.fit)
+    if np.abs(far).max() <= IMPLAUSIBLE:
         return best
-    try:
-        found = weighed(case, with_effects(case, [(c, linear)], GUIDED / first))
-    except FAILURES:
+    start = best.fit.values.copy()
+    for v, at, size in zip(c.variables, c.start, far * c.plausible * GUIDED / np.abs(far).max()):
+        start.put(v, float(at + size))
+    found = from_there(case, [c], Expected(frozenset([c.effect.name]), start))
+    near = None if found is None else weighed(case, found)
+    if near is None or not near.fall > best.fall - CLEAR or np.abs(sizes(near.fit)).max() > np.abs(far).max():
         return best
-    as_good = math.isfinite(found.after) and found.fall > best.fall - CLEAR
-    return found if as_good and _size(case, c, found.fit) < size else best
+    return near
 
 
 def after_at(case: Case, values: Values) -> float:

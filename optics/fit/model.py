@@ -80,11 +80,6 @@ class Model(Protocol):
         """Whether predictions have errors of samples that matter beside the camera's noise, others for other seeds."""
         ...
 
-    @property
-    def quick(self) -> bool:
-        """Whether predictions take milliseconds: readings of a table, and images through layers that no LED shades."""
-        ...
-
     def at(self, values: Values, index: int) -> dict[str, Any]:
         """Every parameter's value in a frame: base <- fitted in all frames <- set in this frame <- fitted in it."""
         ...

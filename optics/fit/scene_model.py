@@ -36,7 +36,6 @@ CUT_OFF = 3  # readings of 0, and none below, that tell of an instrument that sh
 DERIVATIVES = 2e8  # bytes of derivative images that are kept: the refits of a diagnosis begin with those of its scores
 KEPT = 4  # points in parameter space, for each frame, at which the variance that settings bring is remembered
 BESIDE = 2  # px: with a blur of 0.4 px, what is left out beyond changes used values by 1e-5 of the image
-QUICK = 3e5  # values of a set of images up to which every effect that stands out may be calibrated
 FLAT_FIELDS = ("multiplicative", "additive", "none")
 
 
@@ -769,12 +768,6 @@ class SceneModel:
         if self._dialled(index):
             noise = noise + self._of_settings(values, index)
         return noise
-
-    @property
-    def quick(self) -> bool:
-        """Whether predictions take milliseconds: readings of a table, or images through layers that no LED shades."""
-        shaded = bool(self.scene.leds) or self.monte_carlo
-        return self.captures.table is not None or not (shaded or len(self.frames) * self.size > QUICK)
 
     @property
     def dialled(self) -> bool:

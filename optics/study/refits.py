@@ -68,8 +68,7 @@ class Refits:
         extra = [v for v in variables if v.name not in self.known]
         over = [v.name for v in extra]  # of the base the best start is known
         if not self.by_chords() or not extra or list(frames) != list(self.base.frames):
-            accuracy = {} if model.captures.table is not None else {"tolerance": ROUGH}
-            return calibrate.fit_over_starts(model, variables, start, frames, over=over, **accuracy)
+            return calibrate.fit_over_starts(model, variables, start, frames, over=over)
         names = tuple(over)
         found = self.taken_up(extra)  # a diagnosis asks again from another start, which chord steps do not use
         if found is None:
@@ -94,8 +93,8 @@ class Refits:
         return found if self.fall(found) > 0 else None
 
     def by_chords(self) -> bool:
-        """Whether chord steps are worth it."""
-        return not self.model.quick and self.base.normal is not None
+        """Whether chord steps are worth it: readings of a table are predicted in milliseconds."""
+        return self.model.captures.table is None and self.base.normal is not None
 
     def curved(self, extra: Sequence[Variable]) -> int:
         """How many of these have no slope at neutral."""

@@ -64,7 +64,6 @@ class Exact:
 
     monte_carlo = False
     sampled = False
-    quick = False
     captures = None
     driven = None  # what a frame sets is a light's power itself
     drives: frozenset[str] = frozenset()

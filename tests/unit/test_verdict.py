@@ -103,6 +103,22 @@ def test_a_missing_effect_is_claimed_with_its_strength():
     assert "does not prove" in d.text() and f"strength {row.refit.strength[0]:.4f}" in d.sentence
 
 
+def test_an_effect_that_is_found_beside_another_is_asked_alone(monkeypatch):
+    """Its score, low as that of a plate that a turned film hides, leaves it out of the refits; beside the effect that
+    was refitted it explains everything, and so it does without that."""
+    from optics.diagnosis import diagnose as module
+
+    effects, choose = library("vignetting", "gamma"), module._choose
+    monkeypatch.setattr(module, "_choose", lambda *a: [c for c in choose(*a) if c.effect.name == "gamma"])
+    d = judge(*calibrated({"vignetting": 0.3}, seed=2), effects)
+    assert (d.word, d.missing) == ("CLAIM", "vignetting")
+    assert {"vignetting", "gamma"} in [set(e.effects) for e in d.explanations]
+    row = d.row("vignetting")
+    assert (
+        abs(row.refit.strength[0] - 0.3) < 4 * row.refit.sd[0] and "vignetting" in d.compared and d.fits["vignetting"]
+    )
+
+
 def test_an_onset_that_is_not_linear_is_claimed_with_its_strength():
     d = case("defocus")
     row = d.row("defocus")
