@@ -112,6 +112,7 @@ SHOWN: dict[str, tuple[View, tuple[str, ...] | None]] = {
     "servo-scale": (FULL_TURN, ("analyzer",)),  # an error that grows with the angle
     "servo-backlash": (View("polarizer_bench", {}, {"analyzer.approach": 1.0}, "analyzer.angle"), None),
     "source-drift": (View("polarizer_bench", {}, {}, "source.time", (0.0, 30.0)), None),
+    "dark-drift": (View("polarizer_bench", {}, {}, "source.time", (0.0, 30.0)), None),
     "polarized-source": (View("polarizer_bench", {}, {"analyzer.inserted": 0.0}, "polarizer.angle"), None),
     "retardance": (CROSSED, None),
     "optical-rotation": (BENCH, None),
@@ -150,6 +151,7 @@ SHOWN: dict[str, tuple[View, tuple[str, ...] | None]] = {
 
 FACTOR = {
     "exponential-skirt": 1,  # beyond, the skirt reaches past the fine part of the mesh, whose end shows
+    "dark-drift": 1,  # beyond, it settles at once
     "stress-birefringence": 10,  # below, the two points of load outshine the fringes
 }  # effect -> multiple of the plausible strength
 
