@@ -322,6 +322,7 @@ def search(case: Case, chosen: Sequence[Candidate], fits: dict[str, Fit]) -> Out
     _within(case, trials, fits)
     outcome = compete(case, list(trials.values()))
     if race.exchange([*outcome.survivors, *outcome.larger]):
+        _within(case, trials, fits)
         outcome = compete(case, list(trials.values()))
     return _weighed_by_blocks(case, outcome)
 
@@ -350,8 +351,16 @@ def _within(case: Case, trials: dict[frozenset[str], Trial], fits: dict[str, Fit
     """Refit the sets within the best explanations from where these are, without an effect that they can do without.
 
     The best effect may be one that no derivative of the base points to, and that is found beside another: of a plate of
-    50 degrees the base's images show the turn of a film, and beside that turn the plate, which explains all."""
-    scale = _scale(case, trials.values())
+    50 degrees the base's images show the turn of a film, and beside that turn the plate, which explains all. Where that
+    makes a set the best one, its own parts are asked in turn."""
+    for _ in range(LARGEST - 1):
+        if not _without_one(case, trials, fits):
+            break
+
+
+def _without_one(case: Case, trials: dict[frozenset[str], Trial], fits: dict[str, Fit]) -> bool:
+    """One round of that; whether any refit explains more than was known."""
+    scale, any_improved = _scale(case, trials.values()), False
     for t in sorted(trials.values(), key=lambda t: -_score(t, scale))[:LEADERS]:
         for c in t.members if len(t.members) > 1 else []:
             rest = [m for m in t.members if m is not c]
@@ -364,14 +373,46 @@ def _within(case: Case, trials: dict[frozenset[str], Trial], fits: dict[str, Fit
             start = t.fit.values.copy()
             for v, at in zip(c.variables, c.start):
                 start.put(v, float(at))
-            found = from_there(case, rest, Expected(names, start))
-            made = None if found is None else _trial(case, rest, found)
-            if made is None or not made.fall > reached:
-                continue
-            trials[names] = made
-            if len(rest) == 1:
-                fits[rest[0].effect.name] = made.fit
-                write(case, rest[0], weighed(case, made.fit), rest[0].row.net)
+            if _improved(case, trials, fits, rest, start):
+                any_improved = True
+                if len(rest) == 1:
+                    _rivals(case, trials, fits, rest[0])
+    return any_improved
+
+
+def _improved(
+    case: Case, trials: dict[frozenset[str], Trial], fits: dict[str, Fit], members: list[Candidate], start: Values
+) -> bool:
+    """Refit a set from a start; whether it explains more than it did before."""
+    names = frozenset(c.effect.name for c in members)
+    found = from_there(case, members, Expected(names, start))
+    made = None if found is None else _trial(case, members, found)
+    if made is None or not made.fall > (trials[names].fall if names in trials else -math.inf):
+        return False
+    trials[names] = made
+    if len(members) == 1:
+        fits[members[0].effect.name] = made.fit
+        write(case, members[0], weighed(case, made.fit), members[0].row.net)
+    return True
+
+
+def _rivals(case: Case, trials: dict[frozenset[str], Trial], fits: dict[str, Fit], own: Candidate) -> None:
+    """Refit the other effects from where one was found that the base had hidden: theirs may be hidden there as well."""
+    values = fits[own.effect.name].values.copy()
+    for v, at in zip(own.variables, own.start):
+        values.put(v, float(at))
+    known = [c for c in case.table.order if not c.broken]
+    there = [Candidate.at(case.model, values, c.effect, c.variables) for c in known]
+    evidence = measure(case.model, values, case.base, there, case.evidence.frames, case.rows_max, case.seed, silent)
+    solve(evidence, there, case.seed)
+    needed = TRUSTED * next(t.row.net for t in there if t.effect.name == own.effect.name)
+    for c, t in zip(known, there):
+        if t.effect.name == own.effect.name or t.broken or not t.row.net > needed:
+            continue
+        start = values.copy()
+        for v, at, step in zip(c.variables, t.start, START * t.change_of(t.linear)):
+            start.put(v, float(np.clip(at + step, *v.parameter.bounds)))
+        _improved(case, trials, fits, [c], start)
 
 
 def _nothing(case: Case) -> Trial:

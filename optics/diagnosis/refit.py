@@ -24,7 +24,7 @@ from optics.scene.parameter import Values, Variable
 START = 0.7  # of the expected change, to begin a refit from: the linear estimate overshoots more often than not
 LOW_START = 0.1  # of the expected change: a second start, for effects whose images bend
 ENOUGH = 0.5  # of the predicted fall: a refit that brings it needs no second start
-IMPLAUSIBLE = 10.0  # times the plausible strength: flagged
+IMPLAUSIBLE, TIMES = 10.0, "times the plausible strength"  # flagged
 NONLINEAR = 2.0  # factor between the fall and its prediction, beyond which an effect is flagged
 ROOM = 0.9  # of the way to a bound that a start may go: at a bound, one-sided derivatives vanish
 LEFT = 0.1  # of the way to a bound that the base keeps from it, for the same reason
@@ -268,9 +268,10 @@ def write(case: Case, c: Candidate, best: Attempt, predicted: float) -> None:
     unusual = {
         "nonlinear": not 1 / NONLINEAR <= ratio <= NONLINEAR and predicted > CLEAR,
         "at a bound": bool(ended),
-        f"{size.max():.2g} times the plausible strength": size.max() > IMPLAUSIBLE and best.fall > CLEAR,
+        f"{size.max():.2g} {TIMES}": size.max() > IMPLAUSIBLE and best.fall > CLEAR,
     }
-    c.row.flags += [flag for flag, so in unusual.items() if so and flag not in c.row.flags]
+    kept = [flag for flag in c.row.flags if flag not in unusual and not flag.endswith(TIMES)]  # of an earlier refit
+    c.row.flags[:] = [*kept, *(flag for flag, so in unusual.items() if so)]
 
 
 def known_of(found: Fit, c: Candidate) -> str:
