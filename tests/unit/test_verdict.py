@@ -119,6 +119,31 @@ def test_an_effect_that_is_found_beside_another_is_asked_alone(monkeypatch):
     )
 
 
+@pytest.mark.parametrize("lost, near", [(-140.0, True), (5.0, True), (40.0, False)])
+def test_of_two_ends_of_films_that_turn_the_nearer_is_kept(lost, near, monkeypatch):
+    """Both turned by a quarter more let the same light pass: the end near neutral is taken unless it explains less."""
+    from optics.diagnosis import refit
+
+    zero = Parameter("offset", "deg", 0.0, (-180.0, 180.0), neutral=0.0, plausible=1.0, period=180.0)
+    films = [Variable(f"{film}.offset", (f"{film}.offset",), zero) for film in ("analyzer", "polarizer")]
+    c = SimpleNamespace(variables=films, start=np.zeros(2), plausible=np.ones(2), effect=SimpleNamespace(name="off"))
+    case = SimpleNamespace(model=SimpleNamespace(at=lambda values, i: values.at(i), parameters={}))
+
+    def ended(analyzer, polarizer, fall):
+        values = Values({"analyzer.offset": analyzer, "polarizer.offset": polarizer})
+        return refit.Attempt(SimpleNamespace(values=values, fall=fall), fall, 0.0, 0.0, [])
+
+    begun = []
+    there = ended(0.2, -9.15, 996.0 - lost)
+    monkeypatch.setattr(refit, "from_there", lambda case, members, e: begun.append(e.values) or there.fit)
+    monkeypatch.setattr(refit, "weighed", lambda case, fit: refit.Attempt(fit, fit.fall, 0.0, 0.0, []))
+    monkeypatch.setattr(refit, "value_of", lambda model, values, v: values.common[v.name])
+    far = ended(80.8, -89.7, 996.0)
+    assert refit._nearer(case, c, far).fit is (there if near else far).fit
+    assert max(map(abs, begun[0].common.values())) == pytest.approx(refit.GUIDED)
+    assert refit._nearer(case, c, there) is there and len(begun) == 1  # of what is plausible no other end is looked for
+
+
 def test_an_onset_that_is_not_linear_is_claimed_with_its_strength():
     d = case("defocus")
     row = d.row("defocus")
