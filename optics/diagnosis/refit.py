@@ -211,10 +211,18 @@ def after_at(case: Case, values: Values) -> float:
     return chi2(case, values)[0] + case.prior_chi2(values)
 
 
-def further(model: Model, variables: Sequence[Variable], start: Values, frames: Sequence[int], **options) -> Fit:
+def further(
+    model: Model,
+    variables: Sequence[Variable],
+    start: Values,
+    frames: Sequence[int],
+    *,
+    asked: float = math.inf,
+    negligible: float = COARSE,
+) -> Fit:
     """A calibration of images that continues another one, as far as a diagnosis needs it."""
     return calibrate.fit(
-        model, variables, start, frames, max_iterations=FEW, tolerance=ROUGH, negligible=COARSE, **options
+        model, variables, start, frames, max_iterations=FEW, tolerance=ROUGH, negligible=negligible, asked=asked
     )
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -52,6 +53,22 @@ class Refits:
         # of refits with priors that counted more, which kept them from wherever a wrong base goes
         self.starts: dict[tuple[str, ...], Fit] = {}
 
+    @cached_property
+    def coarse(self) -> float:
+        """COARSE of what neighbouring pixels share of the base's excess, as a share of all of it: noise that is stated
+        too small is nothing that a refit could miss."""
+        shared = count = 0.0
+        for index, prediction in zip(self.base.frames, self.model.predict(self.base.values, self.base.frames)):
+            use = np.broadcast_to(self.model.usable(index), prediction.shape)
+            sd = np.sqrt(self.model.variance(self.base.values, index, prediction))
+            r = np.where(use, (self.model.frames[index].image - prediction) / sd, 0.0)
+            count += float(use.sum())
+            both = [(r[:, 1:] * r[:, :-1], use[:, 1:] & use[:, :-1]), (r[1:] * r[:-1], use[1:] & use[:-1])]
+            pairs = sum(float(known.sum()) for _, known in both)
+            shared += use.sum() * sum(float(product.sum()) for product, _ in both) / max(pairs, 1.0)
+        excess = max(self.base.chi2 - count, 1.0)
+        return COARSE * float(np.clip(shared / excess, 0.0, 1.0))
+
     def foresee(self, sets: Sequence[Sequence[Variable]], say: Callable[[str, int, int], None]) -> None:
         """Chord steps of each set of variables, so that the best is known before any is calibrated."""
         if not self.by_chords():
@@ -77,7 +94,7 @@ class Refits:
                 found = self.calibrated(variables, extra, frames)
             elif found is None:  # a chord per parameter misses their products
                 found = calibrate.fit_over_starts(
-                    model, variables, start, frames, tolerance=ROUGH, over=over, negligible=COARSE
+                    model, variables, start, frames, tolerance=ROUGH, over=over, negligible=self.coarse
                 )
             self.results[names] = found
             self.keep(found, extra)
@@ -88,7 +105,7 @@ class Refits:
         if names not in self.starts:
             return None
         found = calibrate.fit(
-            self.model, variables, self.starts[names].values, frames, tolerance=ROUGH, negligible=COARSE
+            self.model, variables, self.starts[names].values, frames, tolerance=ROUGH, negligible=self.coarse
         )
         return found if self.fall(found) > 0 else None
 
@@ -106,7 +123,7 @@ class Refits:
         if names not in self.chords:
             steps = {n: self.steps[n] for n in names if n in self.steps}
             self.chords[names] = calibrate.extended(
-                self.model, self.base, extra, steps, seed=self.setup.seed, negligible=COARSE
+                self.model, self.base, extra, steps, seed=self.setup.seed, negligible=self.coarse
             )
         return self.chords[names]
 
@@ -119,11 +136,12 @@ class Refits:
         if quick.converged or not max(self.fall(quick), quick.promised) > PROMISING * leader:
             return quick
         asked = self.minimised(self.base) - PROMISING * leader
-        best = min((further(self.model, variables, quick.values, frames, asked=asked), quick), key=self.minimised)
+        longer = further(self.model, variables, quick.values, frames, asked=asked, negligible=self.coarse)
+        best = min((longer, quick), key=self.minimised)
         if self.fall(best) > AS_PROMISED * quick.promised or self.minimised(best) > asked:
             return best
         values = off_neutral(self.model, Values(dict(self.setup.values)), extra)
-        afresh = fit_base(self.model, variables, frames, values, tolerance=ROUGH, negligible=COARSE)
+        afresh = fit_base(self.model, variables, frames, values, tolerance=ROUGH, negligible=self.coarse)
         return min((best, afresh), key=self.minimised)
 
     def cooler(self, refits: Sequence[Fit]) -> Cooled | None:

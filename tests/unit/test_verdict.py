@@ -119,6 +119,20 @@ def test_an_effect_that_is_found_beside_another_is_asked_alone(monkeypatch):
     )
 
 
+def test_noise_that_is_stated_too_small_ends_no_refit_early():
+    """Of the excess that a lens brings neighbours share most; of one of noise beyond its stated size, nothing."""
+    from optics.diagnosis.refit import COARSE
+    from optics.study.refits import Refits
+
+    misses, base = calibrated({"vignetting": 0.3}, seed=2)
+    assert Refits(misses, None, base, ()).coarse > 0.7 * COARSE
+    noisy, base = calibrated(seed=2)
+    quiet = replace(noisy.noise, dark_noise=0.6 * noisy.noise.dark_noise, system_gain=0.4 * noisy.noise.system_gain)
+    noisy.noise = quiet
+    base = mock_fit(noisy, base.variables, base.values, FITTED)
+    assert base.chi2 > 1.8 * base.dof and Refits(noisy, None, base, ()).coarse < 0.05 * COARSE
+
+
 @pytest.mark.parametrize("lost, near", [(-140.0, True), (5.0, True), (40.0, False)])
 def test_of_two_ends_of_films_that_turn_the_nearer_is_kept(lost, near, monkeypatch):
     """Both turned by a quarter more let the same light pass: the end near neutral is taken unless it explains less."""
