@@ -59,6 +59,7 @@ VIEW = (
     "bands",
     "white",
     "settings",
+    "time",
 )  # what functions see as `camera` beside its parameters
 
 

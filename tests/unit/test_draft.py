@@ -639,6 +639,7 @@ def test_names_that_functions_of_a_camera_see_are_those_that_no_effect_may_take(
         sensitivity="identity",
         channels=(),
         curves={},
+        clock="",
         integral=None,
         numbers={n: SimpleNamespace(neutral=None) for n in own},
         normalised=lambda own, u, v: (u, v, 1.0),

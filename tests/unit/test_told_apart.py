@@ -287,7 +287,7 @@ def test_a_refit_begins_where_an_earlier_diagnosis_had_the_effect(monkeypatch, t
     better already."""
     asked = []
     case = SimpleNamespace(expected=[refit.Expected(frozenset(["b"]), "earlier")], before=1000.0)
-    c = SimpleNamespace(effect=SimpleNamespace(name="b"), form="tangent", row=SimpleNamespace(flags=[]))
+    c = SimpleNamespace(effect=SimpleNamespace(name="b"), form="tangent", row=SimpleNamespace(flags=[]), variables=[])
     monkeypatch.setattr(refit, "with_effects", lambda *_: "from the base")
     monkeypatch.setattr(refit, "from_there", lambda *_: asked.append(1) or "from there")
     monkeypatch.setattr(refit, "after_at", lambda case, values: there)

@@ -142,6 +142,7 @@ def test_chord_steps_that_stopped_short_of_a_promise_are_calibrated(monkeypatch,
     base.normal = object()  # chord steps are possible
     model = SimpleNamespace(captures=SimpleNamespace(table=None), parameters={"m.a": p, "m.b": p, "m.c": p})
     refits = Refits(model, Setup("captures"), base, [])
+    refits.coarse = 0.01
     refits.chords[("c",)] = fit(other, 42.0, converged=True, reason="chord steps", promised=60.0)
     refits.chords[("b",)] = fit(extra, 84.0, converged=False, reason="chord steps", promised=promised)
     whole = fit(extra, 40.0, converged=True, reason="converged")
