@@ -403,9 +403,12 @@ def _rivals(case: Case, trials: dict[frozenset[str], Trial], fits: dict[str, Fit
         values.put(v, float(at))
     known = [c for c in case.table.order if not c.broken]
     there = [Candidate.at(case.model, values, c.effect, c.variables) for c in known]
-    evidence = measure(case.model, values, case.base, there, case.evidence.frames, case.rows_max, case.seed, silent)
-    solve(evidence, there, case.seed)
-    needed = TRUSTED * next(t.row.net for t in there if t.effect.name == own.effect.name)
+    try:
+        evidence = measure(case.model, values, case.base, there, case.evidence.frames, case.rows_max, case.seed, silent)
+        solve(evidence, there, case.seed)
+    except FAILURES:
+        return
+    needed = TRUSTED * max((t.row.net for t in there if t.effect.name == own.effect.name), default=math.inf)
     for c, t in zip(known, there):
         if t.effect.name == own.effect.name or t.broken or not t.row.net > needed:
             continue
