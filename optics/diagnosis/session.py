@@ -23,7 +23,9 @@ from optics.diagnosis.evidence import Evidence, known_products
 from optics.fit.model import Model
 
 APART = 0.3  # frames: what they do not share is one of each
-FEWEST_FRAMES = 3  # from which it is asked what a lamp did in each: of fewer, two strengths say all
+# From which it is asked what a lamp did in each. Of six frames, four of them fitted, a lamp that wandered by a percent
+# was claimed as the wobble of an analyser while more were needed.
+FEWEST_FRAMES = 3
 LEAST = 1e-3  # of the noise of a reading: what its instrument brings, at least
 MOST = 64  # values that share an error, beyond which they are left as they are
 

@@ -3,8 +3,7 @@
 Definition
     m' = m + dark_drift g(time)          m: the response, 1 = full scale; `time`: a setting of the frame or reading
     g(t) = (1 - exp(-settling t))/settling                                 t where settling is 0: it never settles
-with settling = `dark_settling`. A dark current doubles about every 8 K, an amplifier's zero walks with its temperature;
-the temperature approaches a balance at one rate.
+with settling = `dark_settling`. Dark current and an amplifier's zero depend on temperature, which approaches a balance.
 Fingerprint
     follows the clock and is the same in bright and in dark readings: the extinguished ones show it most. A source that
     drifts changes the bright ones, a dark offset is there from the first reading on.
@@ -12,7 +11,7 @@ Validity
     one number for all channels; a detector that approaches its balance at one rate, from time 0 on. Slow light of the
     room that grows by the clock looks alike.
 References
-    EMVA 1288 release 4.0, 2.2 (dark signal) and 7.4 (dark current against temperature); Newton's law of cooling.
+    EMVA 1288 release 4.0, 2.2 (dark signal); Newton's law of cooling.
 """
 
 from types import SimpleNamespace

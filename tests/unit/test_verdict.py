@@ -119,6 +119,20 @@ def test_an_effect_that_is_found_beside_another_is_asked_alone(monkeypatch):
     )
 
 
+@pytest.mark.parametrize("onset, net, asked", [("both", 30.0, True), ("both", 15.0, False), ("tangent", 30.0, False)])
+def test_an_effect_whose_image_bends_is_refitted_from_a_fifth_of_the_best_score_on(onset, net, asked):
+    from optics.diagnosis import diagnose as module
+
+    def scored(name, net, onset="tangent"):
+        row = SimpleNamespace(net=net, p_family=0.0)
+        return SimpleNamespace(effect=SimpleNamespace(name=name, onset=onset), row=row)
+
+    best, bent = [scored(f"effect {i}", 100.0 - i) for i in range(module.MAX_REFITS)], scored("bent", net, onset)
+    table = SimpleNamespace(order=[*best, bent], preferred={})
+    case = SimpleNamespace(table=table, evidence=SimpleNamespace(is_table=False))
+    assert (bent in module._choose(case, 3)) is asked
+
+
 def test_noise_that_is_stated_too_small_ends_no_refit_early():
     """Of the excess that a lens brings neighbours share most; of one of noise beyond its stated size, nothing."""
     from optics.diagnosis.refit import COARSE
