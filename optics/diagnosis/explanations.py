@@ -44,7 +44,6 @@ from optics.diagnosis.refit import (
     FAILURES,
     START,
     Case,
-    Expected,
     clear,
     excess_of,
     from_there,
@@ -342,7 +341,7 @@ def _expected(case: Case, trials: dict[frozenset[str], Trial]) -> None:
         members = [c for c in case.table.order if c.effect.name in e.names]
         if e.names in trials or len(members) < 2 or not _fits_in(case, members):
             continue
-        found = from_there(case, members, e)
+        found = from_there(case, members, e.values)
         if found is not None:
             trials[e.names] = _trial(case, members, found)
 
@@ -385,7 +384,7 @@ def _improved(
 ) -> bool:
     """Refit a set from a start; whether it explains more than it did before."""
     names = frozenset(c.effect.name for c in members)
-    found = from_there(case, members, Expected(names, start))
+    found = from_there(case, members, start)
     made = None if found is None else _trial(case, members, found)
     if made is None or not made.fall > (trials[names].fall if names in trials else -math.inf):
         return False

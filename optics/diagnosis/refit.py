@@ -179,7 +179,7 @@ def _best_attempt(case: Case, c: Candidate, predicted: float, linear: np.ndarray
         best = _nearer(case, c, best)
     for e in case.expected:
         if e.names == {c.effect.name} and (best is None or after_at(case, e.values) < best.after - CLEAR):
-            there = from_there(case, [c], e)
+            there = from_there(case, [c], e.values)
             again = None if there is None else weighed(case, there)
             if again is not None and math.isfinite(again.after) and (best is None or again.fall > best.fall):
                 best = again
@@ -199,7 +199,7 @@ def _nearer(case: Case, c: Candidate, best: Attempt) -> Attempt:
     start = best.fit.values.copy()
     for v, at, size in zip(c.variables, c.start, far * c.plausible * GUIDED / np.abs(far).max()):
         start.put(v, float(at + size))
-    found = from_there(case, [c], Expected(frozenset([c.effect.name]), start))
+    found = from_there(case, [c], start)
     near = None if found is None else weighed(case, found)
     if near is None or not near.fall > best.fall - CLEAR or np.abs(sizes(near.fit)).max() > np.abs(far).max():
         return best
@@ -226,12 +226,12 @@ def further(
     )
 
 
-def from_there(case: Case, members: Sequence[Candidate], expected: Expected) -> Fit | None:
-    """The refit of effects from where an earlier diagnosis left them; None without a result."""
+def from_there(case: Case, members: Sequence[Candidate], values: Values) -> Fit | None:
+    """The refit of effects from values that another fit came to; None without a result."""
     variables = [*case.base, *(v for c in members for v in c.variables)]
     again = calibrate.fit if case.evidence.is_table else further  # of readings, to its end
     try:
-        return again(case.model, variables, expected.values, list(case.fitted))
+        return again(case.model, variables, values, list(case.fitted))
     except FAILURES:
         return None
 

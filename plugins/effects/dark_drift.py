@@ -1,9 +1,10 @@
 """Dark drift: the dark signal grows or falls while readings are taken, as the detector warms.
 
 Definition
-    m' = m + dark_drift g(time)          m: the response, 1 = full scale; `time`: a setting of the frame or reading
-    g(t) = (1 - exp(-settling t))/settling                                 t where settling is 0: it never settles
-with settling = `dark_settling`. Dark current and an amplifier's zero depend on temperature, which approaches a balance.
+    m' = m + dark_drift g(time)                   `time`: a setting of the frame or reading
+    g(t) = (1 - exp(-settling t))/settling        t where settling is 0: it never settles
+of the response m, 1 = full scale, with settling = `dark_settling`. Dark current and an amplifier's zero depend on
+temperature, which approaches a balance.
 Fingerprint
     follows the clock and is the same in bright and in dark readings: the extinguished ones show it most. A source that
     drifts changes the bright ones, a dark offset is there from the first reading on.

@@ -163,7 +163,7 @@ def test_of_two_ends_of_films_that_turn_the_nearer_is_kept(lost, near, monkeypat
 
     begun = []
     there = ended(0.2, -9.15, 996.0 - lost)
-    monkeypatch.setattr(refit, "from_there", lambda case, members, e: begun.append(e.values) or there.fit)
+    monkeypatch.setattr(refit, "from_there", lambda case, members, values: begun.append(values) or there.fit)
     monkeypatch.setattr(refit, "weighed", lambda case, fit: refit.Attempt(fit, fit.fall, 0.0, 0.0, []))
     monkeypatch.setattr(refit, "value_of", lambda model, values, v: values.common[v.name])
     far = ended(80.8, -89.7, 996.0)
