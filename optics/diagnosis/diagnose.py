@@ -27,10 +27,10 @@ from optics.diagnosis import statistics as st
 from optics.diagnosis.decide import Findings, decide
 from optics.diagnosis.evidence import Candidate, Progress, silent
 from optics.diagnosis.explanations import Outcome
-from optics.diagnosis.findings import basis_of, findings_of, subject_of
+from optics.diagnosis.findings import basis_of, findings_of, followed, subject_of
 from optics.diagnosis.laws import other_laws
 from optics.diagnosis.refit import Case, Cooled, Expected, after_at, refit_each
-from optics.diagnosis.result import Basis, Diagnosis, Family, Fingerprint, Row, Split, kinds_of
+from optics.diagnosis.result import Basis, Diagnosis, Family, Fingerprint, Level, Row, Split, kinds_of
 from optics.diagnosis.score import score
 from optics.diagnosis.text import leaves_misfit, sentence
 from optics.diagnosis.thresholds import CLEAR, EXCESS, LEVEL, MARGIN, MAX_SPLIT, SHARE, close
@@ -164,6 +164,10 @@ def diagnose(
     reference = best.fall - best.expectation if subject else max([c.row.net for c in table.order], default=0.0)
     fingerprints = prints.fingerprints(model, evidence, places, max(reference, 1.0), say)
     families = prints.families(fingerprints)
+    curve = followed(case, subject, best.fit, best.fall - best.expectation, fingerprints)
+    if curve:
+        outcome, levels = _without_followers(case, outcome, levels, curve.coordinate)
+        subject, best = subject_of(case, outcome), outcome.best
     beside = case.session if evidence.is_table else None if best.by_frame else case.lamp
     laws = other_laws(model, evidence, places, added, variables_of, outcome.scale, beside)
     splits, chance = _split(case, outcome, subject, basis)
@@ -221,6 +225,17 @@ def diagnose(
         fits=fits,
         evidence=replace(evidence, blocks=[], sigma=[], whitened=[], use=[], candidates=table.order),
     )
+
+
+def _without_followers(
+    case: Case, outcome: Outcome, levels: list[Level], coordinate: str
+) -> tuple[Outcome, list[Level]]:
+    """The competition where strengths of each frame follow a setting: what happens to frames by themselves, as the
+    drift of a lamp does, follows nothing that is set. Where nothing else explains the residual they stay."""
+    if not any(t.members and not t.by_frame for t in outcome.survivors):
+        return outcome, levels
+    gone = [t for t in outcome.trials if t.by_frame]
+    return held.judge(case, explanations.beside_refuted(case, outcome, gone, f"its strengths follow {coordinate}"))
 
 
 def _best_first(case: Case, fits: Mapping[str, Fit]) -> list[Fit]:

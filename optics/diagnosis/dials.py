@@ -15,11 +15,16 @@ may act besides, so that it does not count as dial error: the images of every ef
 slow waves of a lamp or an amplifier along the session; s^2, at least 1, a noise that is larger than is stated. All
 effects change slowly along a dial or along the session, and errors of single settings do not: that tells them apart.
 
+Of images that are taken one by one, a gain of each frame is as sudden as a dial. Its size is sought besides, and the
+width has a prior: at the turning points of the light a dial shows nothing, and no dial is off by so much that half as
+much light passes.
+
 Source: Patterson & Thompson, Recovery of inter-block information when block sizes are unequal, Biometrika 58, 545
 (1971)."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -27,10 +32,10 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from optics.diagnosis import statistics as st
-from optics.diagnosis.correlation import WANDER
 from optics.diagnosis.evidence import Candidate, Evidence, measure, silent
 from optics.diagnosis.refit import FAILURES
 from optics.diagnosis.score import base_variables, candidates_of
+from optics.diagnosis.thresholds import EACH, USUAL
 from optics.fit import calibrate
 from optics.fit.result import Fit
 from optics.fit.scene_model import SceneModel
@@ -38,7 +43,9 @@ from optics.scene.declare import Effect
 from optics.scene.parameter import Variable
 
 LOOSE = 10.0  # plausible sizes that every effect may have, before it counts as dial error
-WIDTHS = np.geomspace(1e-3, 10.0, 361)  # deg
+WIDTHS = np.concatenate([[0.0], np.geomspace(1e-3, 10.0, 361)])  # deg
+SIZES = np.concatenate([[0.0], np.geomspace(0.1, 30.0, 26)])  # plausible sizes of what acts on each frame
+BY_EYE = 0.5  # deg: of a dial that is read by eye on a scale in degrees
 SCALES = 40  # sizes of the noise that are tried
 NOTED = 1.0  # twice the log likelihood that errors must gain: chance brings as much on one of six exact benches, and
 # the width that it finds there is small
@@ -88,8 +95,9 @@ def width_of(
     """The error that the settings of all unstated dials have; None where readings show none.
 
     It is sought about the calibrated base first. What a strong effect leaves beside its tangent would count as dial
-    error there. So, of readings, it is sought again about a fit of all effects at once, each held by a prior of LOOSE
-    plausible sizes, and the smaller of the two is returned. Of images such a fit would take minutes.
+    error there. So it is sought again about a fit of all effects at once, each held by a prior of LOOSE plausible
+    sizes, or, of images, where such a fit would take minutes, of the likeliest effect; and the smaller of the two is
+    returned.
 
     fit, effects, variables_of, fitted, seed   as of `optics.diagnosis.diagnose.diagnose`
     """
@@ -98,13 +106,12 @@ def width_of(
         return None
     base, _ = base_variables(model, fit, fitted)
     candidates, _ = candidates_of(model, fit, effects, variables_of, fitted)
-    first = _width_about(
-        model, measure(model, fit.values, base, candidates, fitted, ROWS, seed, silent), candidates, keys
-    )
-    if first is None or model.captures.table is None:
+    evidence = measure(model, fit.values, base, candidates, fitted, ROWS, seed, silent)
+    first, acting = _width_about(model, evidence, candidates, keys)
+    if first is None or not acting:
         return first
     values, held = fit.values.copy(), {}
-    for c in [c for c in candidates if not c.broken]:
+    for c in acting:
         for v, start, size, usual in zip(c.variables, c.start, c.plausible, c.usual):
             if v.name not in held:  # two effects may free the same variable
                 held[v.name] = v.with_prior(float(start), LOOSE * float(size))
@@ -115,34 +122,66 @@ def width_of(
         return first
     others = [Candidate.at(model, found.values, c.effect, c.variables) for c in candidates if not c.broken]
     again = measure(model, found.values, base, others, fitted, ROWS, seed, silent)
-    second = _width_about(model, again, others, keys)
+    second, _ = _width_about(model, again, others, keys)
     return second if second is None or second.sd < first.sd else first
 
 
 def _width_about(
     model: SceneModel, evidence: Evidence, candidates: Sequence[Candidate], keys: Sequence[str]
-) -> Width | None:
-    """The width about calibrated values."""
-    acting = [c for c in candidates if not c.broken]
+) -> tuple[Width | None, list[Candidate]]:
+    """(the width about calibrated values, the effects that may act besides: of readings all, of images the likeliest,
+    if any)."""
+    # of images, what has a strength for each frame is sought beside the width, as a gain
+    acting = [c for c in candidates if not c.broken and (evidence.is_table or c.effect.scope != "frame")]
     known = [i for c in acting for columns in c.forms.values() for i in columns]
-    # a strength of each frame, of its plausible size, would be any dial's error
-    sizes = [c.plausible * (1.0 if c.effect.scope == "frame" else LOOSE) for c in acting for _ in c.forms]
-    first, fitted = len(evidence.base), [*evidence.base]
-    beside, errors = [_slow(model, evidence)], [_errors(model, evidence, key) for key in keys]
+    sizes = np.concatenate([*(LOOSE * c.plausible for c in acting for _ in c.forms), []])
+    slow, errors = _slow(model, evidence), [_errors(model, evidence, key) for key in keys]
     ends = np.cumsum([0, *(len(block.r) for block in evidence.blocks)])
-    width = first + len(known) + sum(part.shape[1] for part in (*beside, *errors))
+    first, beside = len(evidence.base), len(evidence.base) + len(known)
+    width = beside + sum(part.shape[1] for part in (slow, *errors))
     gram, score = np.zeros((width, width)), np.zeros(width)
     for block, start, end in zip(evidence.blocks, ends, ends[1:]):
-        own = [block.columns([*fitted, *known]), *(part[start:end] for part in (*beside, *errors))]
-        columns = np.hstack([part if isinstance(part, np.ndarray) else part.toarray() for part in own])
+        own = [part[start:end].toarray() for part in (slow, *errors)]
+        columns = np.hstack([block.columns([*evidence.base]), block.columns(known) * sizes, *own])
         there = np.flatnonzero(columns.any(0))
         gram[np.ix_(there, there)] += columns[:, there].T @ columns[:, there]
         score[there] += columns[:, there].T @ block.r
-    scale = np.ones(width)
-    scale[first : first + len(known)] = np.concatenate([*sizes, []])
     square = sum(float(block.r @ block.r) for block in evidence.blocks)
-    found = Products(gram * np.outer(scale, scale), score * scale, square, int(ends[-1]))
-    return found.most_likely(first, first + len(known) + beside[0].shape[1])
+    found, sized = Products(gram, score, square, int(ends[-1])), beside + slow.shape[1]
+    if evidence.is_table:
+        return most_likely([found.likelihood(first, sized)]), acting
+    # a few images have fewer settings than there are effects, which would take up any error together
+    ends = first + np.cumsum([0, *(sum(map(len, c.forms.values())) for c in acting)])
+    alone = [range(first, first), *map(range, ends, ends[1:])]
+    profiles = []
+    for own in alone:
+        part = found.of_columns([*range(first), *own, *range(beside, width)])
+        profiles.append(part.likelihood(first, first + len(own), first + len(own) + slow.shape[1], EACH * bool(own)))
+    best = max(range(len(profiles)), key=lambda i: profiles[i].likelihood.max() if profiles[i] else -math.inf)
+    return most_likely(profiles), acting[best - 1 : best] if best else []
+
+
+@dataclass(frozen=True)
+class Profile:
+    """Twice the log likelihood of widths, deg; several of each, by what else is sought."""
+
+    likelihood: np.ndarray
+    widths: np.ndarray
+
+
+def most_likely(profiles: Sequence[Profile | None]) -> Width | None:
+    """The width of largest likelihood, whatever of several sets of effects acts besides; None where exact dials are as
+    likely."""
+    known = [p for p in profiles if p is not None]
+    if not known:
+        return None
+    likelihood, widths = (np.concatenate(arrays) for arrays in zip(*((p.likelihood, p.widths) for p in known)))
+    best = int(np.argmax(likelihood))
+    gain = float(likelihood[best] - likelihood[widths == 0].max())
+    if gain < NOTED:
+        return None
+    near = widths[likelihood > likelihood[best] - 1]  # the profile's interval
+    return Width(float(widths[best]), float(near.min()), float(near.max()), gain)
 
 
 @dataclass(frozen=True)
@@ -158,47 +197,72 @@ class Products:
     def of(cls, images: np.ndarray, residual: np.ndarray) -> Products:
         return cls(images.T @ images, images.T @ residual, float(residual @ residual), len(residual))
 
-    def most_likely(self, fitted: int, beside: int) -> Width | None:
-        """The width of largest likelihood, see the module: columns before `fitted` were fitted, those before `beside`
-        are L, the others D."""
+    def of_columns(self, columns: Sequence[int]) -> Products:
+        return Products(self.gram[np.ix_(columns, columns)], self.score[columns], self.square, self.count)
+
+    def likelihood(self, fitted: int, beside: int, sized: int | None = None, cost: float = 0.0) -> Profile | None:
+        """Of the covariance of the module: columns before `fitted` were fitted, those before `beside` are L, those
+        before `sized` are L by a size that is sought too, in units of theirs; the others D. None where there is nothing
+        to tell a width by.
+
+        A size that is sought is as likely as the strength of an effect (`optics.diagnosis.explanations`); cost: what
+        the effects of L cost besides."""
+        sized = beside if sized is None else sized
         inverse, rank = st.inverse(self.gram[:fitted, :fitted])
         across = self.gram[fitted:, :fitted] @ inverse
         information = self.gram[fitted:, fitted:] - across @ self.gram[:fitted, fitted:]
         score = self.score[fitted:] - across @ self.score[:fitted]
         chi2 = self.square - float(self.score[:fitted] @ inverse @ self.score[:fitted])
-        free, first = self.count - rank, beside - fitted
+        free, first = self.count - rank, sized - fitted
         # what a fit takes up but for rounding, as a leak does a lamp behind crossed films, is not seen
         seen = np.diag(information) > st.VISIBLE * np.diag(self.gram)[fitted:]
         information, score = information * np.outer(seen, seen), score * seen
         if free < FEWEST or not np.diag(information)[first:].any():
             return None
+        sizes = SIZES if sized > beside else np.ones(1)
+        found = []
+        for size in sizes:
+            scale = np.ones(len(score))
+            scale[beside - fitted : first] = size
+            found.append(Products(information * np.outer(scale, scale), score * scale, chi2, free).reduced(first))
+        scales = np.geomspace(1.0, max(max(float(left[0]) for left, _ in found) / free, 1.0) * 2, SCALES)
+        likelihood = np.array([-(left / scales[:, None] + free * np.log(scales)[:, None] + log) for left, log in found])
+        widths = np.sqrt(WIDTHS**2 * scales[:, None])  # (scale, width)
+        if sized > beside:
+            likelihood -= 3 * np.log1p(sizes**2 / 2)[:, None, None] + unlikely(widths)
+        return Profile(likelihood.ravel() - cost, np.broadcast_to(widths, likelihood.shape).ravel())
+
+    def reduced(self, first: int) -> tuple[np.ndarray, np.ndarray]:
+        """(chi2, ln det) for each of WIDTHS, at the scale 1, columns before `first` being L and the others D; ln det
+        but for what all sets of the same columns share."""
         # of alike images that are 1e9 times larger than noise, rounding leaves no difference, nor its sign
-        inverse, _ = st.inverse(np.eye(first) + information[:first, :first])
-        mixed = inverse @ information[:first, first:]
-        chi2 -= float(score[:first] @ inverse @ score[:first])
-        shares, turn = np.linalg.eigh(information[first:, first:] - information[first:, :first] @ mixed)
-        square = (turn.T @ (score[first:] - mixed.T @ score[:first])) ** 2
-        widths = np.concatenate([[0.0], WIDTHS])[:, None] ** 2
-        ratios = 1 + widths * np.maximum(shares, 0.0)
-        left, logs = chi2 - (square * widths / ratios).sum(1), np.log(ratios).sum(1)
-        scales = np.geomspace(1.0, max(float(left[0]) / free, 1.0) * 2, SCALES)
-        likelihood = -(left / scales[:, None] + free * np.log(scales)[:, None] + logs)
-        best = np.unravel_index(int(np.argmax(likelihood)), likelihood.shape)
-        gain = float(likelihood[best] - likelihood[:, 0].max())
-        if gain < NOTED:
-            return None
-        own = np.sqrt(widths[:, 0] * scales[:, None])
-        near = own[likelihood > likelihood[best] - 1]  # of any scale: the profile's interval
-        return Width(float(own[best]), float(near.min()), float(near.max()), gain)
+        beside = np.eye(first) + self.gram[:first, :first]
+        inverse, _ = st.inverse(beside)
+        mixed = inverse @ self.gram[:first, first:]
+        chi2 = self.square - float(self.score[:first] @ inverse @ self.score[:first])
+        shares, turn = np.linalg.eigh(self.gram[first:, first:] - self.gram[first:, :first] @ mixed)
+        square = (turn.T @ (self.score[first:] - mixed.T @ self.score[:first])) ** 2
+        ratios = 1 + WIDTHS[:, None] ** 2 * np.maximum(shares, 0.0)
+        return chi2 - (square * WIDTHS[:, None] ** 2 / ratios).sum(1), np.log(ratios).sum(1) + _log_det(beside)
+
+
+def unlikely(width: float | np.ndarray) -> float | np.ndarray:
+    """-2 ln of the prior density of a width, deg. It is a Gaussian's, not Student's as of the strength of an effect:
+    whoever turns a dial reads it."""
+    return np.square(width / BY_EYE)
+
+
+def _log_det(matrix: np.ndarray) -> float:
+    return float(np.linalg.slogdet(matrix)[1])
 
 
 def _slow(model: SceneModel, evidence: Evidence) -> csr_array:
     """(n, k) what a lamp or an amplifier may do besides. Of readings, slow waves along the session, rms 1 LOOSE noises
-    in all; of frames, a gain of each, of WANDER."""
+    in all; of frames, a gain of each, of USUAL."""
     order, signal = evidence.order(model), evidence.lit(model)
     rows, place = np.unique(order, return_inverse=True)
     if not evidence.is_table:
-        return csr_array((WANDER * signal, (np.arange(len(signal)), place)), shape=(len(signal), len(rows)))
+        return csr_array((USUAL * signal, (np.arange(len(signal)), place)), shape=(len(signal), len(rows)))
     count = min(max(len(rows) // PER_WAVE, 1), WAVES)
     waves = np.cos(np.pi * (place[:, None] + 0.5) / len(rows) * np.arange(1, count + 1)) * np.sqrt(2 / count)
     rms = float(np.sqrt(np.mean(np.square(signal))))

@@ -87,6 +87,7 @@ class Trial:
     bare       whether it leaves no more of images than noise that is stated too small (MISSTATED), without structure,
                and a lamp that wanders unnoticed
     ahead      chi2 of the blocks that were left out in turn, less that of the base; NaN where it was not computed
+    refuted    what rules it out besides its score, in words; '' for nothing
     """
 
     members: list[Candidate]
@@ -103,6 +104,7 @@ class Trial:
     readings: Readings | None = None
     bare: bool = False
     ahead: float = math.nan
+    refuted: str = ""
 
     @property
     def names(self) -> frozenset[str]:
@@ -146,7 +148,8 @@ class Outcome:
     shared       whether noise that neighbouring readings share explains it as well as the best does
     wander       rms of such noise over that of the signal, where nothing else explains it
     untried      pairs of effects of images that may do better than the best by their scores, and were not refitted
-    refuted      explanations that would survive, but for the frames that were held out (`optics.diagnosis.held_out`)
+    refuted      explanations that would survive, but for frames that were held out (`optics.diagnosis.held_out`) or for
+                 strengths of each frame that follow a setting
     """
 
     leader: Trial
@@ -216,7 +219,7 @@ class Outcome:
                     told={c.effect.name: known_of(t.fit, c) for c in t.members if t in self.survivors},
                     same_as=same.get(t.names, ""),
                     larger=t in self.larger,
-                    refuted=t in self.refuted,
+                    refuted=t.refuted if t in self.refuted else "",
                     values=t.fit.values.record() if len(t.members) > 1 and t in [*self.survivors, *self.larger] else {},
                 )
             )
@@ -386,7 +389,7 @@ def _improved(
     names = frozenset(c.effect.name for c in members)
     found = from_there(case, members, start)
     made = None if found is None else _trial(case, members, found)
-    if made is None or not made.fall > (trials[names].fall if names in trials else -math.inf):
+    if made is None or not made.fall > (trials[names].fall if names in trials else 0.0):
         return False
     trials[names] = made
     if len(members) == 1:
@@ -777,8 +780,10 @@ def compete(case: Case, trials: list[Trial]) -> Outcome:
     return _with_survivors(case, outcome)
 
 
-def beside_refuted(case: Case, outcome: Outcome, refuted: Sequence[Trial]) -> Outcome:
-    """The competition of all other explanations; those that held-out frames refute stay in its record."""
+def beside_refuted(case: Case, outcome: Outcome, refuted: Sequence[Trial], why: str) -> Outcome:
+    """The competition of all other explanations; those that are refuted stay in its record."""
+    for t in refuted:
+        t.refuted = why
     gone = [*outcome.refuted, *refuted]
     rest = compete(case, [t for t in outcome.trials if t not in gone])
     rest = _weighed_by_blocks(case, rest) if case.evidence.is_table else replace(rest, untried=outcome.untried)
@@ -984,7 +989,7 @@ def _significant(case: Case, best: Trial, inner: Trial) -> float:
     return float(chdtri(max(free, 1), single))
 
 
-def _design_effect(case: Case, outcome: Outcome, one: Trial, other: Trial) -> float:
+def design_effect(case: Case, outcome: Outcome, one: Trial, other: Trial) -> float:
     """By how much the variance of the difference of two chi2 of images exceeds what independent noise makes."""
     direction = _kept(case, [a - b for a, b in zip(one.images, other.images)])
     left = _kept(case, outcome.leader.images)
@@ -1038,7 +1043,7 @@ def _less_alike(case: Case, outcome: Outcome, fall: float, best: Trial, other: T
     once, however often it counted in the fit."""
     weighed = case.prior_chi2(other.fit.values) - case.prior_chi2(best.fit.values)
     known = case.known_chi2(other.fit.values) - case.known_chi2(best.fit.values)
-    return (fall - weighed) / _design_effect(case, outcome, best, other) + known
+    return (fall - weighed) / design_effect(case, outcome, best, other) + known
 
 
 def _kept(case: Case, images: Sequence[np.ndarray]) -> list[np.ndarray]:

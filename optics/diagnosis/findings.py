@@ -11,6 +11,7 @@ import numpy as np
 
 from optics.diagnosis import fingerprints as prints
 from optics.diagnosis import statistics as st
+from optics.diagnosis import turned_wrong
 from optics.diagnosis.correlation import NOTICED, WANDER
 from optics.diagnosis.decide import Findings, Opponent, ordered, rivals
 from optics.diagnosis.dials import unstated
@@ -18,7 +19,7 @@ from optics.diagnosis.evidence import Candidate, Evidence, at_bound
 from optics.diagnosis.explanations import Outcome, beside_noise, fall_over_noise, lead_without
 from optics.diagnosis.refit import Case, clear
 from optics.diagnosis.result import Basis, Fingerprint, Law, Level, Split
-from optics.diagnosis.thresholds import AS_GOOD, DETAIL, HIDDEN, LEVEL, MISSTATED, TOLD, UNEVEN
+from optics.diagnosis.thresholds import AS_GOOD, DETAIL, HIDDEN, LEVEL, MISSTATED, SURE, TOLD, UNEVEN
 from optics.fit.compare import led_label
 from optics.fit.model import Model, value_of
 from optics.fit.result import Fit
@@ -63,7 +64,7 @@ def subject_of(case: Case, outcome: Outcome) -> Candidate | None:
     against waits for the others: these are missing whatever the dials did."""
     best = outcome.best
     able = [c for c in best.members if c.effect.name in outcome.core] or best.members
-    able = [c for c in able if not _unset(case, c)] or able
+    able = [c for c in able if not _unset(case, outcome, c)] or able
     return max(able, key=lambda c: outcome.own_fall(best, c.effect.name), default=None)
 
 
@@ -102,7 +103,7 @@ def findings_of(
     if swings := _swings(outcome, fingerprints, basis):
         return replace(own, rival=True, ratio=swings.ratio, coordinate=swings.coordinate, curve_share=swings.share)
     whole = {f.coordinate: f.net for f in fingerprints}
-    followed = _followed(case, subject, best.fit, best.fall - best.expectation, fingerprints)
+    curve = followed(case, subject, best.fit, best.fall - best.expectation, fingerprints)
     fingerprints = [f for f in fingerprints if not f.per_frame]
     # a curve is no better than effects while any set of them does as well: the leader, not the simplest beside it
     leader = outcome.leader if subject else outcome.base
@@ -128,7 +129,7 @@ def findings_of(
         complete,
         complete or case.evidence.is_table,
     )
-    better = [followed] if followed else [] if _is_detail(own) else rivals(fingerprints, opponent)
+    better = [curve] if curve else [] if _is_detail(own) else rivals(fingerprints, opponent)
     # beside noise that explains most, a curve of something else may seem to do better than an effect
     better = [f for f in better if whole[f.coordinate] >= AS_GOOD * own.fall]
     best_curve = better[0] if better else fingerprints[0]
@@ -137,7 +138,7 @@ def findings_of(
         own,
         ratio=best_curve.net / max(fall, 1.0),
         rival=bool(better),
-        curve_lead=math.inf if followed else 0.0 if complete else lead,
+        curve_lead=math.inf if curve else 0.0 if complete else lead,
         coordinate=best_curve.coordinate,
         curve_share=best_curve.share,
     )
@@ -214,7 +215,7 @@ def _of_subject(
         at_end=_at_end(subject, strength),
         complete=best.complete,
         ran=_ran(case, best.fit),
-        unset=_unset(case, subject),
+        unset=_unset(case, outcome, subject),
         chance=chance,
         carried=carried,
         carried_by=carried_by,
@@ -240,12 +241,17 @@ def _at_end(subject: Candidate, strength: Sequence[float]) -> str:
     return ", ".join(ends)
 
 
-def _unset(case: Case, subject: Candidate) -> str:
-    """The dials that images turn and nobody states, beside an effect with a strength per frame."""
+def _unset(case: Case, outcome: Outcome, subject: Candidate) -> str:
+    """The dials that images turn and nobody states, where their errors may be what an effect with a strength per frame
+    explains."""
     model = case.model
     if subject.effect.scope != "frame" or case.evidence.is_table or not isinstance(model, SceneModel):
         return ""
-    return " and ".join(unstated(model))
+    keys = unstated(model)
+    names = outcome.best.names, subject.effect.name
+    if keys and names not in case.over_dials:
+        case.over_dials[names] = turned_wrong.lead_over(case, outcome, subject, keys)
+    return " and ".join(keys) if keys and case.over_dials[names] <= SURE else ""
 
 
 def _ran(case: Case, fit: Fit) -> str:
@@ -284,7 +290,7 @@ def _carried(case: Case, outcome: Outcome, subject: Candidate) -> tuple[float, s
     return fall / total, part
 
 
-def _followed(
+def followed(
     case: Case, subject: Candidate | None, fit: Fit, net: float, fingerprints: Sequence[Fingerprint]
 ) -> Fingerprint | None:
     """The curve along a setting (clocks aside), or of LEDs, that an effect's per-frame strengths follow, and that

@@ -50,7 +50,7 @@ def judge(case: Case, outcome: Outcome) -> tuple[Outcome, list[Level]]:
         ]
         if not (kept and refuted):
             break
-        outcome = beside_refuted(case, outcome, refuted)
+        outcome = beside_refuted(case, outcome, refuted, "held-out frames refute it")
     return outcome, levels_of(outcome.best)
 
 
@@ -98,9 +98,22 @@ def levels(case: Case, members: Sequence[Candidate], with_them: Fit, wander: flo
             _square(case.model, f, prediction, use, sd, wander)
             for f, prediction, use, sd in zip(held_out, predictions, masks, sds)
         ]
-    better = int(sum(b > w for b, w in zip(base, with_effect)))
+    # a dial that must stand far off what is written down predicts a frame no better than one that misses it
+    without = np.array(base) + _known(case, pose, base_values)
+    having = np.array(with_effect) + _known(case, pose, values)
     say("held-out frames", 2, 2)
-    return [*found, _level(case, name, after, sum(with_effect), count, sum(base) - sum(with_effect), better)]
+    fall, better = float(np.sum(without - having)), int(np.sum(without > having))
+    return [*found, _level(case, name, after, sum(with_effect), count, fall, better)]
+
+
+def _known(case: Case, pose: Sequence[Variable], values: Values) -> np.ndarray:
+    """Of each held-out frame, what was known of its own settings before: chi2 of its priors, each counted once."""
+    found = np.zeros(len(case.held_out))
+    for v in pose:
+        own = [i for i, frame in enumerate(case.held_out) if v.holds_in(frame)]
+        if v.prior is not None and own:
+            found[own] += ((value_of(case.model, values, v) - v.prior[0]) / v.prior[1]) ** 2 / len(own)
+    return found
 
 
 def _crossed(
@@ -114,12 +127,14 @@ def _crossed(
 ) -> list[float]:
     """chi2 of each frame, one half of it predicted by a fit of the other, and the other way round.
 
-    With images X and residuals r of a half at the optimum of both, (G - G_h) step = -X'r moves it to that of the other
-    half. Halves are a chessboard of SQUARES x SQUARES fields, of readings the first and the second half."""
+    With images X and residuals r of a half at the optimum of both, (G - G_h + P) step = -X'r moves it to that of the
+    other half; P holds priors. Halves are a chessboard of SQUARES x SQUARES fields, of readings the first and the
+    second half."""
     found = []
     derivatives = case.model.derivatives(values, free, frames, seed=case.seed)
     for f, prediction, use, sd, (_, images) in zip(frames, predictions, masks, sds, derivatives):
-        acting = [np.asarray(images[v.name], float) for v in free if v.name in images]
+        there = [v for v in free if v.name in images]
+        acting, prior = [np.asarray(images[v.name], float) for v in there], np.diag([v.precision for v in there])
         residual = np.where(use, (np.asarray(case.model.frames[f].image, float) - prediction) / sd, 0.0)
         residual = np.where(np.isfinite(residual), residual, 0.0)
         x = np.stack([np.where(use, image / sd, 0.0) for image in acting], -1) if acting else np.zeros((*use.shape, 0))
@@ -127,7 +142,7 @@ def _crossed(
         gram = np.einsum("hwci,hwcj->ij", x, x)
         for half in (first, ~first):
             own, r = x[half], residual[half]
-            inverse, _ = st.inverse(gram - np.einsum("nci,ncj->ij", own, own))
+            inverse, _ = st.inverse(gram - np.einsum("nci,ncj->ij", own, own) + prior)
             total += float(np.sum((r + own @ (inverse @ np.einsum("nci,nc->i", own, r))) ** 2))
         found.append(total)
     return found

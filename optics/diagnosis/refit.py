@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -65,7 +65,9 @@ class Expected:
 
 @dataclass
 class Case:
-    """A calibrated model under diagnosis; the arguments are those of `optics.diagnosis.diagnose.diagnose`."""
+    """A calibrated model under diagnosis; the arguments are those of `optics.diagnosis.diagnose.diagnose`.
+
+    over_dials   (explanation, its effect with a strength per frame) -> lead over errors of dials, where it was asked"""
 
     model: Model
     fit: Fit
@@ -81,6 +83,7 @@ class Case:
     places: list[dict[str, np.ndarray]] | None = None
     foresee: Callable[[Sequence[Sequence[Variable]], Progress], None] | None = None
     expected: Sequence[Expected] = ()
+    over_dials: dict[tuple[frozenset[str], str], float] = field(default_factory=dict)
 
     @cached_property
     def session(self) -> Session:

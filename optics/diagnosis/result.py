@@ -105,7 +105,7 @@ class Explanation:
     same_as      name of a better one that survives and predicts the same values, under another name: no value of these
                  captures can tell the two apart, however often it is taken again; '' for none
     larger       whether it contains one that survives, and has a better score: likelier, but not shown to be needed
-    refuted      whether frames that were held out rule it out: with it they are predicted worse than without
+    refuted      what rules it out besides its score, in words; '' for nothing
     values       {"common": ..., "frame": ...} of its fit, where it is possible and has several effects: once one of
                  them is added, the next diagnosis looks for the others there
     """
@@ -126,7 +126,7 @@ class Explanation:
     told: dict[str, str] = field(default_factory=dict)
     same_as: str = ""
     larger: bool = False
-    refuted: bool = False
+    refuted: str = ""
     values: dict[str, dict] = field(default_factory=dict, repr=False)
 
     @property

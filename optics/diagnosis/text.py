@@ -423,7 +423,7 @@ def _explanation_lines(d: Diagnosis) -> list[str]:
         behind, needed = ("-", "-") if e in alive[:1] else (f"{e.lead:.3g}", f"{e.needed:.3g}")
         more = "contains a survivor, and is likelier" if e.larger else "contains a survivor"
         mark = "survives" if e.survives else more if e.larger or not e.lead > e.needed else ""
-        mark = "held-out frames refute it" if e.refuted else mark
+        mark = e.refuted or mark
         lines.append((e.name, f"{e.fall:.4g}", f"{e.cost:.3g}", f"{e.excess_sd:.2g} sd", behind, needed, blocks, mark))
     return [
         "",

@@ -1253,7 +1253,7 @@ def _explanations(d: Mapping) -> list[dict]:
 def _why_not(e: Mapping) -> str:
     """Why a set of effects does not survive, where its score does not say so."""
     if e.get("refuted"):
-        return "held-out frames refute it"
+        return str(e["refuted"])
     return "" if as_float(e.get("lead")) > as_float(e.get("needed")) else "contains a survivor"
 
 

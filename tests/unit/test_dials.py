@@ -5,8 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from optics.diagnosis.dials import LOOSE, Products
+from optics.diagnosis.dials import LOOSE, Products, most_likely
 from optics.diagnosis.session import _whitening
+from optics.diagnosis.thresholds import EACH
 
 COUNT = 72
 DIAL = np.linspace(-90.0, 85.0, COUNT)
@@ -32,7 +33,7 @@ def drawn(rng, sd, hidden=0.0):
 def test_the_error_of_dials_is_found_whatever_acts_besides(hidden):
     """Of 72 settings a width is known to 1/sqrt(2 x 72), 8 %; 40 benches bring that to 1.3 %."""
     rng = np.random.default_rng(1)
-    found = [products(drawn(rng, 0.5, hidden)).most_likely(2, 4) for _ in range(40)]
+    found = [most_likely([products(drawn(rng, 0.5, hidden)).likelihood(2, 4)]) for _ in range(40)]
     sds = np.array([f.sd for f in found])
     assert np.mean(sds) == pytest.approx(0.5, rel=0.05) and np.std(sds) < 0.08
     assert np.mean([f.low <= 0.5 <= f.high for f in found]) > 0.5  # 68 % of intervals of one sd
@@ -42,14 +43,14 @@ def test_exact_dials_have_none():
     """Chance brings NOTED on one of six benches (it has one side only, and a larger noise is a rival); the width is
     a third of what the readings could not miss."""
     rng = np.random.default_rng(2)
-    found = [f for _ in range(100) if (f := products(drawn(rng, 0.0)).most_likely(2, 4)) is not None]
+    found = [f for _ in range(100) if (f := most_likely([products(drawn(rng, 0.0)).likelihood(2, 4)])) is not None]
     assert len(found) < 30 and all(f.sd < 0.15 for f in found)
 
 
 def test_noise_that_is_stated_too_small_is_no_dial_error():
     """Three times the noise, everywhere alike: dials would be silent at the turning points."""
     rng = np.random.default_rng(3)
-    widths = [products(3 * rng.standard_normal(COUNT)).most_likely(2, 4) for _ in range(40)]
+    widths = [most_likely([products(3 * rng.standard_normal(COUNT)).likelihood(2, 4)]) for _ in range(40)]
     assert sum(w is not None and w.gain > 6 for w in widths) <= 2
 
 
@@ -60,10 +61,12 @@ def test_images_that_dwarf_the_noise_change_no_width():
     residual = drawn(rng, 0.5)
     leak = (LIGHT**2)[:, None]
     one = np.column_stack([FITTED, leak, BESIDE, np.diag(SLOPE)])
-    plain = Products.of(one, residual).most_likely(2, 5)
+    plain = most_likely([Products.of(one, residual).likelihood(2, 5)])
     for size in 10.0 ** np.arange(3, 11):
         alike = size * leak * (1 + 1e-9 * rng.standard_normal((COUNT, 3)))
-        found = Products.of(np.column_stack([FITTED, alike, BESIDE, np.diag(SLOPE)]), residual).most_likely(2, 7)
+        found = most_likely(
+            [Products.of(np.column_stack([FITTED, alike, BESIDE, np.diag(SLOPE)]), residual).likelihood(2, 7)]
+        )
         assert found is not None and found.sd == pytest.approx(plain.sd, rel=0.1), size
 
 
@@ -73,7 +76,7 @@ def test_the_likelihood_is_that_of_the_covariance():
     errors = np.zeros((COUNT, COUNT // 2))  # two readings at each setting
     errors[np.arange(COUNT), np.arange(COUNT) // 2] = SLOPE
     residual = errors @ (0.7 * rng.standard_normal(COUNT // 2)) + rng.standard_normal(COUNT)
-    found = products(residual, errors).most_likely(2, 4)
+    found = most_likely([products(residual, errors).likelihood(2, 4)])
     rest = np.linalg.qr(FITTED, mode="complete")[0][:, 2:]
 
     def minus_two_ln(width):
@@ -113,3 +116,42 @@ def test_stated_dials_are_not_asked():
         stated_errors={"b.angle"},
     )
     assert unstated(model) == ["a.angle"]  # b is stated, c never turns
+
+
+GAINS = np.diag(0.05 * LIGHT) / NOISE  # of plausible size, whitened
+
+
+@pytest.mark.parametrize("gains, sd", [(0.0, 0.5), (0.2, 0.0)])
+def test_a_gain_of_each_image_is_no_error_of_a_dial_nor_the_other_way_round(gains, sd):
+    """Each image has one setting. Gains of 20 % would be errors of up to 20 deg, as none are made."""
+    rng = np.random.default_rng(6)
+    found = []
+    for _ in range(20):
+        residual = drawn(rng, sd) + gains * LIGHT / NOISE * rng.standard_normal(COUNT)
+        images = Products.of(np.column_stack([FITTED, GAINS, np.diag(SLOPE)])[::2], residual[::2])
+        found.append(most_likely([images.likelihood(2, 2, 2 + COUNT)]))
+    if sd:
+        assert np.mean([f.sd for f in found]) == pytest.approx(sd, rel=0.1)
+    else:
+        assert all(f is None or f.sd < 0.3 for f in found)
+
+
+def test_effects_that_take_up_all_together_do_so_one_at_a_time():
+    """Of twelve settings, as images have: twelve effects and a gain of each would take up any error together. One
+    effect and the gains leave it in seven of ten; in the others the gains may be it as well."""
+    rng = np.random.default_rng(7)
+    few = slice(0, COUNT, 6)
+    angle = np.radians(DIAL[few])
+    waves = np.column_stack([f(n * angle) for n in range(1, 7) for f in (np.cos, np.sin)]) * 0.05 * LIGHT[few, None]
+    gains, slope = np.diag(0.05 * LIGHT[few]) / NOISE, np.diag(SLOPE[few])
+    together, each = [], []
+    for _ in range(16):
+        residual = SLOPE[few] * 0.5 * rng.standard_normal(12) + rng.standard_normal(12)
+        whole = Products.of(np.column_stack([FITTED[few, :1], LOOSE * waves / NOISE, gains, slope]), residual)
+        together.append(most_likely([whole.likelihood(1, 13, 25)]))
+        own = [whole.of_columns([0, *kept, *range(13, 37)]) for kept in ([], *([i] for i in range(1, 13)))]
+        each.append(
+            most_likely([p.likelihood(1, 1 + bool(i), 13 + bool(i), EACH * bool(i)) for i, p in enumerate(own)])
+        )
+    assert sum(f is not None and 0.25 < f.sd < 1.0 for f in each) >= 8
+    assert sum(f is not None for f in together) < 2

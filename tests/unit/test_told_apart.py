@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from optics.diagnosis import diagnose, explanations, findings, laws, refit, score
+from optics.diagnosis import diagnose, explanations, findings, held_out, laws, refit, score
 from optics.diagnosis import statistics as st
 from optics.diagnosis.correlation import Readings
 from optics.diagnosis.result import Law
@@ -39,7 +39,7 @@ def test_where_slopes_show_nothing_a_finite_step_decides():
 def test_what_is_known_of_dials_counts_whole_in_a_fall_and_once(monkeypatch, weight):
     """22 of chi2, 20 of them by which dials need not be off: noise that images share divides the other 2 alone. Where a
     fit that misses images had what is known count many times, it counts once all the same."""
-    monkeypatch.setattr(explanations, "_design_effect", lambda *a: 10.0)
+    monkeypatch.setattr(explanations, "design_effect", lambda *a: 10.0)
     best, without = (SimpleNamespace(fit=SimpleNamespace(values=v)) for v in (1.0, 21.0))
     outcome = SimpleNamespace(best=best, without=lambda *a: without, own_fall=lambda *a: 2.0 + 20.0 * weight)
     case = SimpleNamespace(
@@ -182,7 +182,7 @@ def test_a_lamp_rules_out_nothing_that_leaves_less_where_misfit_is_left(monkeypa
     best, other = trial("a", 1e4, 9e3, 2.97e6, 47.0), trial("b", 1.1e4, 2e3, fall, cost)
     evidence = SimpleNamespace(is_table=False, normal=SimpleNamespace(count=20000), projected=SimpleNamespace(rank=20))
     case = SimpleNamespace(evidence=evidence, prior_chi2=lambda values: 0.0, known_chi2=lambda values: 0.0)
-    monkeypatch.setattr(explanations, "_design_effect", lambda *a: 1.0)
+    monkeypatch.setattr(explanations, "design_effect", lambda *a: 1.0)
     lead, needed = explanations._lead(case, SimpleNamespace(scale=scale), best, other)
     assert (lead > needed) is ruled_out
 
@@ -202,7 +202,7 @@ def test_what_leaves_an_unnoticed_lamp_is_a_rival_of_gains_of_each_frame(monkeyp
     case = SimpleNamespace(
         evidence=SimpleNamespace(is_table=False), prior_chi2=lambda values: 0.0, known_chi2=lambda values: 0.0
     )
-    monkeypatch.setattr(explanations, "_design_effect", lambda *a: 1.0)
+    monkeypatch.setattr(explanations, "design_effect", lambda *a: 1.0)
     outcome = SimpleNamespace(scale=1.0, base=SimpleNamespace(deviance=1003.0 + brings))
     lead, needed = explanations._lead(case, outcome, best, other)
     assert (lead > needed) is ruled_out
@@ -221,10 +221,29 @@ def test_misfit_that_is_left_beside_gains_of_each_frame_is_counted_without_a_lam
     other = trial(1180.0, 2070.0, 0.0, False, {"offset"})
     evidence = SimpleNamespace(is_table=False, normal=SimpleNamespace(count=1000), projected=SimpleNamespace(rank=20))
     case = SimpleNamespace(evidence=evidence, prior_chi2=lambda values: 0.0, known_chi2=lambda values: 0.0)
-    monkeypatch.setattr(explanations, "_design_effect", lambda *a: 1.0)
+    monkeypatch.setattr(explanations, "design_effect", lambda *a: 1.0)
     monkeypatch.setattr(explanations, "_significant", lambda *a: 20.0)
     lead, needed = explanations._lead(case, SimpleNamespace(scale=1.37), best, other)
     assert lead > needed
+
+
+@pytest.mark.parametrize("others, kept", [(["gamma"], ["gamma"]), ([], ["gains"])])
+def test_gains_that_follow_a_setting_give_way_to_what_explains_them(monkeypatch, others, kept):
+    """A gain of each frame is no drift where it follows what was set, if any effect of all frames survives beside it;
+    else it stays, for the verdict that no effect has this shape."""
+    trials = {
+        n: SimpleNamespace(members=[n], by_frame="gains" in n, names=n) for n in ("gains", "gains, leak", "gamma")
+    }
+    outcome = SimpleNamespace(survivors=[trials[n] for n in ("gains", *others)], trials=list(trials.values()))
+
+    def beside(case, outcome, gone, why):
+        assert [t.names for t in gone] == ["gains", "gains, leak"] and "analyzer.angle" in why
+        return SimpleNamespace(survivors=[t for t in outcome.survivors if t not in gone])
+
+    monkeypatch.setattr(explanations, "beside_refuted", beside)
+    monkeypatch.setattr(held_out, "judge", lambda case, outcome: (outcome, ["levels"]))
+    found, levels = diagnose._without_followers(None, outcome, [], "analyzer.angle")
+    assert [t.names for t in found.survivors] == kept and levels == ["levels"] * bool(others)
 
 
 @pytest.mark.parametrize("unset, subject", [("", "gains"), ("analyzer.angle", "vignetting")])
@@ -236,7 +255,7 @@ def test_what_errors_of_dials_stand_against_waits_for_the_others(monkeypatch, un
         core=["gains", "vignetting"],
         own_fall=lambda trial, name: {"gains": 1000.0, "vignetting": 500.0}[name],
     )
-    monkeypatch.setattr(findings, "_unset", lambda case, c: unset if c is gains else "")
+    monkeypatch.setattr(findings, "_unset", lambda case, outcome, c: unset if c is gains else "")
     assert findings.subject_of(None, outcome).effect.name == subject
 
 
