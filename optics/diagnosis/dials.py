@@ -24,7 +24,6 @@ Source: Patterson & Thompson, Recovery of inter-block information when block siz
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -151,14 +150,16 @@ def _width_about(
     if evidence.is_table:
         return most_likely([found.likelihood(first, sized)]), acting
     # a few images have fewer settings than there are effects, which would take up any error together
-    ends = first + np.cumsum([0, *(sum(map(len, c.forms.values())) for c in acting)])
-    alone = [range(first, first), *map(range, ends, ends[1:])]
-    profiles = []
-    for own in alone:
-        part = found.of_columns([*range(first), *own, *range(beside, width)])
-        profiles.append(part.likelihood(first, first + len(own), first + len(own) + slow.shape[1], EACH * bool(own)))
-    best = max(range(len(profiles)), key=lambda i: profiles[i].likelihood.max() if profiles[i] else -math.inf)
-    return most_likely(profiles), acting[best - 1 : best] if best else []
+    places = first + np.cumsum([0, *(sum(map(len, c.forms.values())) for c in acting)])
+    alone = [range(first, first), *map(range, places, places[1:])]
+    found_with: list[tuple[Profile, list[Candidate]]] = []
+    for i, one in enumerate(alone):
+        part = found.of_columns([*range(first), *one, *range(beside, width)])
+        profile = part.likelihood(first, first + len(one), first + len(one) + slow.shape[1], EACH * bool(one))
+        if profile is not None:
+            found_with.append((profile, acting[i - 1 : i] if i else []))
+    _, likeliest = max(found_with, key=lambda f: float(f[0].likelihood.max()), default=(None, []))
+    return most_likely([profile for profile, _ in found_with]), likeliest
 
 
 @dataclass(frozen=True)
