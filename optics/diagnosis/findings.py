@@ -9,9 +9,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from optics.diagnosis import dials_as_rival
 from optics.diagnosis import fingerprints as prints
 from optics.diagnosis import statistics as st
-from optics.diagnosis import turned_wrong
 from optics.diagnosis.correlation import NOTICED, WANDER
 from optics.diagnosis.decide import Findings, Opponent, ordered, rivals
 from optics.diagnosis.dials import unstated
@@ -250,7 +250,7 @@ def _unset(case: Case, outcome: Outcome, subject: Candidate) -> str:
     keys = unstated(model)
     names = outcome.best.names, subject.effect.name
     if keys and names not in case.over_dials:
-        case.over_dials[names] = turned_wrong.lead_over(case, outcome, subject, keys)
+        case.over_dials[names] = dials_as_rival.lead_over(case, outcome, subject, keys)
     return " and ".join(keys) if keys and case.over_dials[names] <= SURE else ""
 
 

@@ -2,7 +2,8 @@
 
 On held-out frames the parameters that all frames share are frozen, and only what each frame has for itself is solved
 for, for the base and for the base with the winner alike. A lamp that wanders by w (rms, relative) from frame to frame
-is such a thing: chi2 = r'(1 + w^2 g g')^-1 r of a frame, with its whitened signal g."""
+is such a thing: chi2 = r'(1 + w^2 g g')^-1 r of a frame, with its whitened signal g. What is known of a frame's own
+settings counts in by how much chi2 falls, but not in the misfit."""
 
 from __future__ import annotations
 

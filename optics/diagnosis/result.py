@@ -337,7 +337,7 @@ class Family:
 class Level:
     """Misfit (in units of the mean signal) and chi2 per value of a model on fitted and on held-out frames.
 
-    fall, frames_better   against the base model on held-out frames, less the variables solved for there
+    fall, frames_better   against the base model on held-out frames, with what is known of the settings of each
     """
 
     model: str

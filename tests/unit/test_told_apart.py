@@ -227,6 +227,22 @@ def test_misfit_that_is_left_beside_gains_of_each_frame_is_counted_without_a_lam
     assert lead > needed
 
 
+@pytest.mark.parametrize("known, fall, better", [(None, 5.0, True), (None, -2e6, False), (9.0, 5.0, False)])
+def test_a_refit_from_the_end_of_another_must_explain_more_than_was_known(monkeypatch, known, fall, better):
+    """More than nothing, where nothing was known: from a base that another effect had moved, a film that was turned by
+    8 deg explained -2 million, and a lamp made up for it."""
+    film = SimpleNamespace(effect=SimpleNamespace(name="film"), row=SimpleNamespace(net=1.0))
+    names, made = frozenset(["film"]), SimpleNamespace(fall=fall, fit="fit")
+    trials = {} if known is None else {names: SimpleNamespace(fall=known)}
+    monkeypatch.setattr(explanations, "from_there", lambda case, members, start: "fit")
+    monkeypatch.setattr(explanations, "_trial", lambda case, members, found: made)
+    monkeypatch.setattr(explanations, "weighed", lambda case, found: None)
+    monkeypatch.setattr(explanations, "write", lambda *a: None)
+    fits = {}
+    assert explanations._improved(None, trials, fits, [film], None) == better
+    assert (trials.get(names) is made) == better and fits == ({"film": "fit"} if better else {})
+
+
 @pytest.mark.parametrize("others, kept", [(["gamma"], ["gamma"]), ([], ["gains"])])
 def test_gains_that_follow_a_setting_give_way_to_what_explains_them(monkeypatch, others, kept):
     """A gain of each frame is no drift where it follows what was set, if any effect of all frames survives beside it;
