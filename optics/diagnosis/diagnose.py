@@ -29,7 +29,7 @@ from optics.diagnosis.evidence import Candidate, Progress, silent
 from optics.diagnosis.explanations import Outcome
 from optics.diagnosis.findings import basis_of, findings_of, followed, subject_of
 from optics.diagnosis.laws import other_laws
-from optics.diagnosis.refit import Case, Cooled, Expected, after_at, refit_each
+from optics.diagnosis.refit import COARSE, Case, Cooled, Expected, after_at, refit_each
 from optics.diagnosis.result import Basis, Diagnosis, Family, Fingerprint, Level, Row, Split, kinds_of
 from optics.diagnosis.score import score
 from optics.diagnosis.text import leaves_misfit, sentence
@@ -64,6 +64,7 @@ def diagnose(
     refit: Callable[..., Fit] | None = None,
     foresee: Callable[[Sequence[Sequence[Variable]], Progress], None] | None = None,
     cooler: Callable[[Sequence[Fit]], Cooled | None] | None = None,
+    negligible: float = COARSE,
     rows_max: int = 400_000,
     seed: int = 0,
     top: int = 5,
@@ -84,6 +85,7 @@ def diagnose(
     foresee       called before the refits, with the variables of each effect that is refitted
     cooler        called with the refits, the best first. Where that one asks that priors count less than in the
                   base, and that may change the verdict, it returns what the diagnosis begins again from; else None
+    negligible    share of what images leave beyond noise below which a promised fall is not worth another linearisation
     rows_max      values (pixel x channel) that curves, splits and alternative weights may use
     seed          of the simulations and of derivative images; the same seed gives the same table
     top           how many of the best effects are refitted, besides those that cannot be told from the best
@@ -119,6 +121,7 @@ def diagnose(
         seed,
         say,
         foresee=foresee,
+        negligible=negligible,
     )
     known = {c.effect.name for c in table.order}
     near = [e for e in expected if e.names <= known]
@@ -142,6 +145,7 @@ def diagnose(
                 fitted=fitted,
                 refit=cooled.refit,
                 foresee=cooled.foresee,
+                negligible=negligible,
                 rows_max=rows_max,
                 seed=seed,
                 top=top,

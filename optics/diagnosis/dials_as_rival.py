@@ -42,7 +42,7 @@ def lead_over(case: Case, outcome: Outcome, subject: Candidate, keys: Sequence[s
     wanted = [*known, *(v for c in others for v in c.variables), *doubted]
     try:
         for _ in range(STEPS):
-            found = further(model, wanted, values, list(case.fitted))
+            found = further(model, wanted, values, list(case.fitted), negligible=case.negligible)
             values = found.values
     except FAILURES:
         return -math.inf

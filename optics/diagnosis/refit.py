@@ -83,6 +83,7 @@ class Case:
     places: list[dict[str, np.ndarray]] | None = None
     foresee: Callable[[Sequence[Sequence[Variable]], Progress], None] | None = None
     expected: Sequence[Expected] = ()
+    negligible: float = COARSE
     over_dials: dict[tuple[frozenset[str], str], float] = field(default_factory=dict)
 
     @cached_property
@@ -232,9 +233,11 @@ def further(
 def from_there(case: Case, members: Sequence[Candidate], values: Values) -> Fit | None:
     """The refit of effects from values that another fit came to; None without a result."""
     variables = [*case.base, *(v for c in members for v in c.variables)]
-    again = calibrate.fit if case.evidence.is_table else further  # of readings, to its end
+    frames = list(case.fitted)
     try:
-        return again(case.model, variables, values, list(case.fitted))
+        if case.evidence.is_table:  # of readings, to its end
+            return calibrate.fit(case.model, variables, values, frames)
+        return further(case.model, variables, values, frames, negligible=case.negligible)
     except FAILURES:
         return None
 

@@ -372,6 +372,7 @@ def _examined(
         refit=refits.of,
         foresee=refits.foresee,
         cooler=refits.cooler,
+        negligible=refits.coarse,
         seed=setup.seed,
         progress=progress,
         ranked=keep,
