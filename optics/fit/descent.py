@@ -38,6 +38,8 @@ EASING = 10.0  # factor between one damping and the next, as Marquardt has it
 LEAST_DAMPING = 1e-9  # below the eigenvalue of a degenerate mode (`result.DEGENERATE`), which may then be followed
 MOST_DAMPING = 1e4  # leaves a ten-thousandth of the step along the gradient: a shorter one is no progress
 SCALED = 2.0  # times the truth: a power that starts further off is solved for before all else
+ON_THE_WAY = 0.1  # of a step: where the second derivative along it is measured
+HALVINGS = 8  # lengths of such a step that are tried
 HUBER = 3.0  # standard deviations beyond which a robust fit lowers the weight of a value
 
 
@@ -272,17 +274,45 @@ class Descent:
         A damped step keeps within REACH, where a linearisation can be trusted at all (a light that is sent past the
         sensor does not come back), or further where steps have brought what they promised. Without damping, only the
         bounds limit it."""
+        u, a, b = self._straight(damping)
+        return self._stepped(u), float(2 * b @ u - u @ a @ u)
+
+    def _straight(self, damping: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(damped step, A, b), all in coordinates."""
         reach = self.trust * self.reach if damping else np.inf
         box = (self.theta, np.maximum(self.lowest, self.theta - reach), np.minimum(self.high, self.theta + reach))
         u, low, high = (np.array([v.parameter.coordinate(t) for v, t in zip(self.variables, values)]) for values in box)
         a = (self.here.a + np.diag(self.curved)) * np.outer(self.slope, self.slope)
         b = self.here.b * self.slope
-        step = solve(a, b, low - u, high - u, damping)
-        fall = float(2 * b @ step - step @ a @ step)
+        return solve(a, b, low - u, high - u, damping), a, b
+
+    def _stepped(self, step: np.ndarray) -> np.ndarray:
+        """Theta after a step in coordinates."""
         moved = np.array([v.parameter.stepped(t, d, self.bent) for v, t, d in zip(self.variables, self.theta, step)])
         for end in (self.low, self.high):  # rounding must not leave a parameter just beside its bound
             moved = np.where((np.abs(moved - end) < self.near) & (end >= self.lowest), end, moved)
-        return np.clip(moved, self.lowest, self.high), fall
+        return np.clip(moved, self.lowest, self.high)
+
+    def around(self) -> float:
+        """Follow a narrow valley that bends: steps along u and its bend, t u + t^2 c with A c = -J'W f''(u)/2, and f''
+        from one prediction on the way (geodesic acceleration: Transtrum & Sethna, arXiv 1201.5885). Returns the gain."""
+        u, a, b = self._straight(0.0)  # as far as it goes: shorter ones are tried
+        part = self._at(self._stepped(ON_THE_WAY * u))[2].b * self.slope
+        second = 2 / ON_THE_WAY**2 * (b - ON_THE_WAY * (a @ u) - part)
+        free = np.full(len(u), np.inf)
+        c = -solve(a, second, -free, free) / 2
+        gained, t = 0.0, 1.0
+        for _ in range(HALVINGS):
+            found = self._at(self._stepped(t * u + t**2 * c))
+            gain = self.here.total - found[2].total
+            if gain > gained:
+                gained, best = gain, found
+            elif gained:
+                break
+            t /= 2
+        if gained:
+            self.theta, self.values, self.here = best
+        return gained
 
     @property
     def lowest(self) -> np.ndarray:

@@ -228,6 +228,42 @@ def test_far_from_the_best_a_factor_moves_straight():
     assert descent.step(0.0)[0] == pytest.approx(np.exp(0.5))
 
 
+class Valley(Exact):
+    """Pixels a (y - x^2 / 2) and the prior of x: a valley along the parabola, a thousand times as steep across."""
+
+    shape = (1, 1, 1)
+    parameters = {
+        "led.x": Parameter("x", "mm", 0.0, (-50.0, 50.0), plausible=1.0),
+        "led.y": Parameter("y", "mm", 0.0, (-50.0, 50.0), plausible=1.0),
+    }
+    base = {"led.x": 0.0, "led.y": 0.0}
+    frames = [Frame("one", np.zeros((1, 1, 1)))]
+    steep = 300.0
+
+    def predict(self, values, frames=None, seed=0):
+        x, y = (values.common[key] for key in self.parameters)
+        return [np.full(self.shape, self.steep * (y - x**2 / 2))]
+
+    def derivatives(self, values, variables, frames=None, secant=None, seed=0):
+        slopes = {"led.x": -self.steep * values.common["led.x"], "led.y": self.steep}
+        yield self.predict(values)[0], {name: np.full(self.shape, slope) for name, slope in slopes.items()}
+
+    def variance(self, values, index, prediction):
+        return np.ones(self.shape)
+
+
+@pytest.mark.parametrize("away", [3.0, 5.0, 7.0])
+def test_a_bent_valley_is_followed_to_its_end(away):
+    """Its straight steps gain a twentieth of what they promise: along the tangent to where the prior lies, chi2 rises
+    to thousands. Without steps around the bend the fit ended with "which no step brought"."""
+    model = Valley()
+    start, prior = Values({"led.x": 0.0, "led.y": 0.0}), (away, 1.0)
+    variables = [Variable(key, (key,), model.parameters[key]) for key in model.parameters]
+    found = fit(model, [variables[0].with_prior(*prior), variables[1]], start, max_iterations=40)
+    assert found.converged, found.reason
+    assert found.total < 2  # as good as the fit is asked for, 1 a variable
+
+
 class Lamps(Exact):
     """Frames in which each lamp of a scene shines alone, y = power (1 + x): one lamp is dead."""
 
