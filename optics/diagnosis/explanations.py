@@ -716,8 +716,10 @@ def _next(rankings: Sequence[_Ranking], trials: Iterable[Trial], tried: set[froz
 
 
 def _bound_wander(case: Case, trials: Iterable[Trial]) -> None:
-    """Where effects leave nothing, a lamp that swings as nobody would let it is no rival of theirs."""
-    most = NOTICED if any(t.members and t.complete for t in trials) else math.inf
+    """Where effects leave nothing, a lamp that swings as nobody would let it is no rival of theirs; nor is it of images
+    where no effect may have a strength for each frame, as where captures state that exposures are the same."""
+    alike = not case.evidence.is_table and not any(c.effect.scope == "frame" for c in case.table.order)
+    most = NOTICED if alike or any(t.members and t.complete for t in trials) else math.inf
     if case.evidence.is_table:
         case.session.most = most
     elif case.lamp is not None:

@@ -9,7 +9,7 @@ import pytest
 
 from optics.diagnosis import diagnose, explanations, findings, held_out, laws, refit, score
 from optics.diagnosis import statistics as st
-from optics.diagnosis.correlation import Readings
+from optics.diagnosis.correlation import NOTICED, Readings
 from optics.diagnosis.result import Law
 from optics.diagnosis.thresholds import TOLD
 from optics.scene import registry
@@ -241,6 +241,36 @@ def test_a_refit_from_the_end_of_another_must_explain_more_than_was_known(monkey
     fits = {}
     assert explanations._improved(None, trials, fits, [film], None) == better
     assert (trials.get(names) is made) == better and fits == ({"film": "fit"} if better else {})
+
+
+@pytest.mark.parametrize(
+    "scopes, complete, most", [(["common"], False, NOTICED), (["frame"], False, math.inf), (["frame"], True, NOTICED)]
+)
+def test_a_lamp_may_swing_where_a_gain_of_each_frame_may_be_missing(scopes, complete, most):
+    """Where captures state one exposure for all frames, or effects leave nothing, a swing that anybody notices is no
+    noise."""
+    order = [SimpleNamespace(effect=SimpleNamespace(scope=scope)) for scope in scopes]
+    case = SimpleNamespace(
+        evidence=SimpleNamespace(is_table=False), table=SimpleNamespace(order=order), lamp=SimpleNamespace(most=0.0)
+    )
+    explanations._bound_wander(case, [SimpleNamespace(members=["a"], complete=complete)])
+    assert case.lamp.most == most
+
+
+@pytest.mark.parametrize("known, share", [(0.0, 1.4), (1000.0, 0.007)])
+def test_a_fall_of_what_is_known_lies_in_no_channel(monkeypatch, known, share):
+    """Dials took the gains up: images fall by 5, 7 of it in one channel, and what is known of the dials by 1000."""
+    before, after = np.zeros((2, 1, 3)), np.zeros((2, 1, 3))
+    before[0, 0] = np.sqrt([7.0, 0.0, 0.0])
+    after[1, 0] = np.sqrt([0.0, 1.0, 1.0])
+    trials = [SimpleNamespace(images=[images]) for images in (before, after)]
+    outcome = SimpleNamespace(best=trials[1], without=lambda *a: trials[0], own_fall=lambda *a: 5.0 + known)
+    frame = SimpleNamespace(name="one", parameters={})
+    case = SimpleNamespace(model=SimpleNamespace(frames=[frame]), evidence=SimpleNamespace(frames=[0]))
+    monkeypatch.setattr(findings.prints, "channel_names", lambda evidence: ["R", "G", "B"])
+    subject = SimpleNamespace(effect=SimpleNamespace(name="gain drift", scope="frame"))
+    found, part = findings._carried(case, outcome, subject)
+    assert found == pytest.approx(share, rel=0.01) and part == "channel R"
 
 
 @pytest.mark.parametrize("others, kept", [(["gamma"], ["gamma"]), ([], ["gains"])])
