@@ -160,9 +160,8 @@ def strengths_told(fit: Fit | np.ndarray, variables: Sequence[Variable], values:
         sd = np.sqrt(np.maximum(np.diag(covariance), 0))
         fine = np.isfinite(sd) & (sd > 0)
         both = np.zeros_like(covariance)
-        both[np.ix_(fine, fine)] = np.linalg.pinv(
-            covariance[np.ix_(fine, fine)] / np.outer(sizes[fine], sizes[fine]), hermitian=True
-        )
+        # in units of what is known of each: one of which nothing is known must not drown the others in rounding
+        both[np.ix_(fine, fine)] = _covariance(covariance[np.ix_(fine, fine)] / np.outer(sizes[fine], sizes[fine]))
         data = both - _priors(variables) * np.outer(fine, fine)
         # of a prior and nothing else, rounding is left
         data[np.abs(data) < 1e-6 * np.sqrt(np.outer(np.diag(both), np.diag(both)))] = 0.0
@@ -260,7 +259,7 @@ def _share(fit: Fit, variables: Sequence[Variable]) -> tuple[np.ndarray, np.ndar
 
 
 def _covariance(a: np.ndarray) -> np.ndarray:
-    """Pseudo-inverse of a precision in its scaled basis, without its null directions."""
+    """Pseudo-inverse of a precision, or of a covariance, in its scaled basis, without its null directions."""
     scale = np.sqrt(np.where(np.diag(a) > 0, np.diag(a), 1.0))
     eigen, vectors = np.linalg.eigh(a / np.outer(scale, scale))
     kept = eigen > 1e-12 * max(eigen.max(initial=0.0), 1e-300)

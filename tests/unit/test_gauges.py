@@ -87,6 +87,16 @@ def test_strengths_are_told_as_combinations():
     assert told.startswith("0.") and told.endswith(" deg") and "(" not in told
 
 
+def test_a_strength_of_which_nothing_is_known_does_not_hide_the_others():
+    """The gain of a frame behind crossed films is known to 3e5, the others to 1e-3: those were told to be unknown."""
+    model = Bench()
+    variables = model.variables("a.offset", "b.offset", "c.offset")
+    found = np.diag([0.01, 3e9, 0.02]) ** 2
+    text = gauges.strengths_told(found, variables, [0.5, 0.0, 1.0])
+    assert text.startswith("a.offset = 0.500 +- 0.010 deg, c.offset = 1.000 +- 0.020 deg"), text
+    assert "(b.offset does not show)" in text
+
+
 def test_an_effect_that_the_base_holds_has_nothing_of_its_own():
     """Beside a free offset of the one film, that of the other is the same angle."""
     model = Bench()
