@@ -272,7 +272,8 @@ def _carried(case: Case, outcome: Outcome, subject: Candidate) -> tuple[float, s
     without = outcome.without(outcome.best, subject.effect.name)
     gain = [np.asarray(a, float) ** 2 - np.asarray(b, float) ** 2 for a, b in zip(without.images, outcome.best.images)]
     # what is known of dials falls too: where they took the effect up, images hardly know of it
-    total = max(sum(float(g.sum()) for g in gain), outcome.own_fall(outcome.best, subject.effect.name))
+    known = case.known_chi2(without.fit.values) - case.known_chi2(outcome.best.fit.values)
+    total = sum(float(g.sum()) for g in gain) + max(known, 0.0)
     frames = [model.frames[f] for f in evidence.frames]
     by: dict[str, dict[str, float]] = {"frame": {}, "LED": {}, "channel": {}}
     for frame, g in zip(frames, gain):

@@ -263,10 +263,14 @@ def test_a_fall_of_what_is_known_lies_in_no_channel(monkeypatch, known, share):
     before, after = np.zeros((2, 1, 3)), np.zeros((2, 1, 3))
     before[0, 0] = np.sqrt([7.0, 0.0, 0.0])
     after[1, 0] = np.sqrt([0.0, 1.0, 1.0])
-    trials = [SimpleNamespace(images=[images]) for images in (before, after)]
-    outcome = SimpleNamespace(best=trials[1], without=lambda *a: trials[0], own_fall=lambda *a: 5.0 + known)
+    trials = [
+        SimpleNamespace(images=[images], fit=SimpleNamespace(values=values))
+        for images, values in ((before, known), (after, 0.0))
+    ]
+    outcome = SimpleNamespace(best=trials[1], without=lambda *a: trials[0])
     frame = SimpleNamespace(name="one", parameters={})
-    case = SimpleNamespace(model=SimpleNamespace(frames=[frame]), evidence=SimpleNamespace(frames=[0]))
+    model, evidence = SimpleNamespace(frames=[frame]), SimpleNamespace(frames=[0])
+    case = SimpleNamespace(model=model, evidence=evidence, known_chi2=lambda values: values)
     monkeypatch.setattr(findings.prints, "channel_names", lambda evidence: ["R", "G", "B"])
     subject = SimpleNamespace(effect=SimpleNamespace(name="gain drift", scope="frame"))
     found, part = findings._carried(case, outcome, subject)
