@@ -126,11 +126,14 @@ def _texture(prediction: np.ndarray) -> dict[str, np.ndarray]:
 
 
 def settings(model: Model, evidence: Evidence) -> dict[str, list[float]]:
-    """key -> value per fitted frame of the numbers that the experimenter turned, other than which LED was on."""
+    """key -> value per fitted frame of the numbers that the experimenter turned, other than which LED was on and those
+    of parts that are absent."""
+    absent = set() if model.captures is None else set(model.captures.absent)
     turned: dict[str, list[float]] = {}
     frames = [model.frames[f] for f in evidence.frames]
     lights = keys_with(model.parameters, "power")
-    for key in sorted({key for f in frames for key in f.parameters if key not in lights}):
+    keys = {key for f in frames for key in f.parameters if key.rpartition(".")[0] not in absent}
+    for key in sorted(keys - set(lights)):
         values = [f.parameters.get(key, math.nan) for f in frames]
         numbers = [float(v) if isinstance(v, (int, float)) else math.nan for v in values]
         if len({v for v in numbers if math.isfinite(v)}) > 1:

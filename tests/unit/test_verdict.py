@@ -1159,3 +1159,17 @@ def test_what_a_whole_image_gains_is_no_difference_between_its_parts():
     assert gained(np.array([0.3, 0.3, 0.6])) > 0.5
     absorbed = Projected(information * 1e-9, information[0] * 0, np.ones(3), np.zeros((0, 3)), 0, 0.0, 0.0)
     assert _together(absorbed, lengths) == (0.0, None)
+
+
+def test_nobody_turned_what_is_absent():
+    """The holder of a sheet that was taken out keeps its scale, and a number for each image: not what images follow."""
+    numbers = [{"sample.angle": 15.0 * i, "analyzer.angle": 90.0 * (i % 2), "led.power": 1.0 * i} for i in range(6)]
+    model = SimpleNamespace(
+        frames=[SimpleNamespace(parameters=p) for p in numbers],
+        parameters={"led.power": SimpleNamespace(role="power")},
+        captures=SimpleNamespace(absent=("sample",)),
+    )
+    evidence = SimpleNamespace(frames=range(6))
+    assert "sample.angle" not in fingerprints.settings(model, evidence)
+    model.captures.absent = ()
+    assert fingerprints.settings(model, evidence)["sample.angle"] == [15.0 * i for i in range(6)]
