@@ -39,7 +39,7 @@ EXCESS = 3.0  # sd of chi2 above its degrees of freedom, from which a misfit is 
 SHORT = 8  # linearisations of such a descent, before it is known to lead anywhere
 LEAD = 10.8  # of chi2, by which another start must be better: a lead that noise alone takes in 1 of 1000 cases
 LEADS = 0.01  # of the excess of chi2, by which it must: ten times what is NEGLIGIBLE to where each of the two ends
-FOLLOWED = 20.0  # part of the promise that a step around the bend of a valley must gain to be followed by another
+FOLLOWED = 0.05  # of the promise: what a step around the bend of a valley must gain to be followed by another
 TRIES = 4  # linearisations close to the optimum, before a fit that no longer gains ends
 CHORD_DAMPING = 1e-6  # of `extended`, which starts at the base's optimum: only directions that nothing determines
 
@@ -315,7 +315,7 @@ def _descend(
             # the last steps gained less than a quarter of what is promised, or good enough was reached before
             stuck = len(history) > 1 and history[-2] - promise / 4 < history[-1]
             if (tries > TRIES and stuck) or (tries > 1 and best[0] < count / 2):
-                if best[0] >= count / 2 and descent.around() > promise / FOLLOWED:
+                if best[0] >= count / 2 and descent.around() > FOLLOWED * promise:
                     continue
                 break
         gained = descent.chord(

@@ -294,8 +294,9 @@ class Descent:
         return np.clip(moved, self.lowest, self.high)
 
     def around(self) -> float:
-        """Follow a narrow valley that bends: steps along u and its bend, t u + t^2 c with A c = -J'W f''(u)/2, and f''
-        from one prediction on the way (geodesic: Transtrum & Sethna, arXiv 1201.5885); returns the gain."""
+        """Follow a narrow valley that bends, by geodesic acceleration (Transtrum & Sethna, arXiv 1201.5885): the best
+        of the steps t u + t^2 c with A c = -J'W f''(u)/2, where f'' comes from one prediction on the way. Returns the
+        gain."""
         u, a, b = self._straight(0.0)  # as far as it goes: shorter ones are tried
         part = self._at(self._stepped(ON_THE_WAY * u))[2].b * self.slope
         second = 2 / ON_THE_WAY**2 * (b - ON_THE_WAY * (a @ u) - part)

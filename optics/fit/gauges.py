@@ -118,7 +118,7 @@ def find(
     full = np.zeros((len(names), len(held)))  # change of each variable in its unit, per unit of the basis
     full[live] = basis / scale[:, None] * sizes[live, None]
     pivots = [int(live[i]) for i in held]
-    covariance = _covariance(precision) * np.outer(sizes, sizes)
+    covariance = _inverse(precision) * np.outer(sizes, sizes)
     multiply = np.zeros(len(names), bool) if factors is None else np.asarray(factors, bool) & (at > 0)
     for group in _groups(full != 0):
         columns = [k for k in range(len(held)) if full[group, k].any()]
@@ -161,14 +161,14 @@ def strengths_told(fit: Fit | np.ndarray, variables: Sequence[Variable], values:
         fine = np.isfinite(sd) & (sd > 0)
         both = np.zeros_like(covariance)
         # in units of what is known of each: one of which nothing is known must not drown the others in rounding
-        both[np.ix_(fine, fine)] = _covariance(covariance[np.ix_(fine, fine)] / np.outer(sizes[fine], sizes[fine]))
+        both[np.ix_(fine, fine)] = _inverse(covariance[np.ix_(fine, fine)] / np.outer(sizes[fine], sizes[fine]))
         data = both - _priors(variables) * np.outer(fine, fine)
         # of a prior and nothing else, rounding is left
         data[np.abs(data) < 1e-6 * np.sqrt(np.outer(np.diag(both), np.diag(both)))] = 0.0
     else:
         both, data = _share(fit, variables)
     found = _of_variables(data, variables, values, both)
-    sd = np.sqrt(np.maximum(np.diag(_covariance(both)), 0)) * sizes
+    sd = np.sqrt(np.maximum(np.diag(_inverse(both)), 0)) * sizes
     apart = [i for i in range(len(variables)) if i not in found.members and i not in found.silent]
     many = len(apart) + len(found.known) > 1
     told = [
@@ -250,7 +250,7 @@ def _share(fit: Fit, variables: Sequence[Variable]) -> tuple[np.ndarray, np.ndar
     sizes = np.array([v.parameter.plausible for v in fit.variables])
     a = fit.normal.a * np.outer(sizes, sizes)
     alone = np.diag(a)[own] - np.diag(_priors([fit.variables[i] for i in own]))
-    both = a[np.ix_(own, own)] - a[np.ix_(own, rest)] @ _covariance(a[np.ix_(rest, rest)]) @ a[np.ix_(rest, own)]
+    both = a[np.ix_(own, own)] - a[np.ix_(own, rest)] @ _inverse(a[np.ix_(rest, rest)]) @ a[np.ix_(rest, own)]
     data = both - _priors([fit.variables[i] for i in own])
     # of what other variables make up for, rounding is left
     gone = np.diag(data) < LIMIT * alone
@@ -258,7 +258,7 @@ def _share(fit: Fit, variables: Sequence[Variable]) -> tuple[np.ndarray, np.ndar
     return both, data
 
 
-def _covariance(a: np.ndarray) -> np.ndarray:
+def _inverse(a: np.ndarray) -> np.ndarray:
     """Pseudo-inverse of a precision, or of a covariance, in its scaled basis, without its null directions."""
     scale = np.sqrt(np.where(np.diag(a) > 0, np.diag(a), 1.0))
     eigen, vectors = np.linalg.eigh(a / np.outer(scale, scale))

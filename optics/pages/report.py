@@ -1253,7 +1253,7 @@ def _explanations(d: Mapping) -> list[dict]:
 def _why_not(e: Mapping) -> str:
     """Why a set of effects does not survive, where its score does not say so."""
     if why := e.get("refuted"):
-        return why if isinstance(why, str) else "held-out frames refute it"  # a record of before said no more
+        return why if isinstance(why, str) else "held-out frames refute it"  # older records say only that
     return "" if as_float(e.get("lead")) > as_float(e.get("needed")) else "contains a survivor"
 
 

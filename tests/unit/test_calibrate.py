@@ -229,7 +229,7 @@ def test_far_from_the_best_a_factor_moves_straight():
 
 
 class Valley(Exact):
-    """Pixels a (y - x^2 / 2) and the prior of x: a valley along the parabola, a thousand times as steep across."""
+    """Pixels a (y - x^2 / 2) and the prior of x: a valley along the parabola, hundreds of times as steep across."""
 
     shape = (1, 1, 1)
     parameters = {
@@ -254,7 +254,7 @@ class Valley(Exact):
 
 @pytest.mark.parametrize("away", [3.0, 5.0, 7.0])
 def test_a_bent_valley_is_followed_to_its_end(away):
-    """Its straight steps gain a twentieth of what they promise: along the tangent to where the prior lies, chi2 rises
+    """Its straight steps gain a sixtieth of what they promise: along the tangent to where the prior lies, chi2 rises
     to thousands. Without steps around the bend the fit ended with "which no step brought"."""
     model = Valley()
     start, prior = Values({"led.x": 0.0, "led.y": 0.0}), (away, 1.0)
