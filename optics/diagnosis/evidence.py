@@ -404,6 +404,12 @@ def measure(
     _require_values(evidence)
     count = evidence.normal.count
     evidence.signal = signal / count - float(model.noise.black_level)
+    if not evidence.signal:
+        raise Underdetermined(
+            f"diagnose: the calibrated model predicts no light in any of {len(frames)} frames: they are no brighter "
+            f"than black_level = {float(model.noise.black_level):g}; expose longer, or correct [noise] black_level in "
+            "captures.toml"
+        )
     evidence.noise = math.sqrt(variance / count) / evidence.signal
     evidence.masked = 1 - (count / total)
     evidence.projected = evidence.project(

@@ -18,6 +18,7 @@ from optics.diagnosis.explanations import Outcome, Trial, beside_refuted, wander
 from optics.diagnosis.refit import Case, chi2
 from optics.diagnosis.result import Level, Shift
 from optics.diagnosis.thresholds import TOLD
+from optics.fit.branches import over_branches
 from optics.fit.calibrate import for_frames
 from optics.fit.model import Model, value_of
 from optics.fit.result import Fit
@@ -160,7 +161,11 @@ def _half(shape: tuple[int, ...]) -> np.ndarray:
 def _predicted(case: Case, values: Values, free: list[Variable]) -> tuple[list[np.ndarray], Values]:
     """Predictions of the held-out frames after fitting what is `free` there, and the values."""
     if free:
-        values = case.refit(case.model, free, values, frames=list(case.held_out)).values
+
+        def follow(values: Values) -> Fit:
+            return case.refit(case.model, free, values, frames=list(case.held_out))
+
+        values = over_branches(case.model, follow(values), follow).values
     return [np.asarray(image, float) for image in case.model.predict(values, case.held_out)], values
 
 

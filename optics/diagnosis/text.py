@@ -22,7 +22,17 @@ from optics.diagnosis.result import (
     Shift,
     kinds_of,
 )
-from optics.diagnosis.thresholds import CLEAR, CLUTTERED, LEVEL, MARGIN, MISSTATED, STRENGTH, SURE, is_structured
+from optics.diagnosis.thresholds import (
+    CLEAR,
+    CLUTTERED,
+    EXCESS,
+    LEVEL,
+    MARGIN,
+    MISSTATED,
+    STRENGTH,
+    SURE,
+    is_structured,
+)
 from optics.words import (
     ANYWHERE,
     NO_LIMIT,
@@ -223,12 +233,19 @@ def _claim(
         if best.complete and len(best.effects) == 1
         else f" Add it, calibrate and diagnose again: with {best.name} nothing is left to explain."
         if best.complete
-        else f" With {best.name} an excess of {best.excess_sd:.2g} sd (structure: p {p_text(best.structure_p)}) is "
-        "left: add it, calibrate and diagnose again."
+        else f" With {best.name} {_left(best)} is left: add it, calibrate and diagnose again."
     )
     return text + (
         " A lower held-out error verifies the prediction, not the cause. The cause rests on the lead "
         f"({f.lead:.3g} in chi2, over {f.against or 'no effect'}), the homogeneity and the absence of a better curve."
+    )
+
+
+def _left(best: Explanation) -> str:
+    """What an explanation leaves. Where the noise is less than captures say, that is no excess but structure."""
+    p = p_text(best.structure_p)
+    return (
+        f"structure (p {p})" if best.excess_sd < EXCESS else f"an excess of {best.excess_sd:.2g} sd (structure: p {p})"
     )
 
 

@@ -305,10 +305,10 @@ def _gauge_text(names: Sequence[str], change: np.ndarray, units: Sequence[str], 
         return f"a common scale of {listed}"
     if equal and len(set(units)) == 1 and len(set(np.sign(change))) == 1:
         return f"a common {'rotation' if units[0] == 'deg' else 'change'} of {listed}"
-    steps = [
-        f"{name} by {'a factor ' if logs else ''}{math.exp(c) if logs else c:+.3g}{'' if logs else spaced(unit)}"
-        for name, c, unit in zip(names, change, units)
-    ]
+    if logs:  # the one that changes most by a factor e
+        steps = [f"{name} by a factor {math.exp(c):.3g}" for name, c in zip(names, change / size.max())]
+    else:
+        steps = [f"{name} by {c:+.3g}{spaced(unit)}" for name, c, unit in zip(names, change, units)]
     return f"a change of {some(steps, 3, ' with ')}"
 
 

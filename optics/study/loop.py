@@ -65,6 +65,7 @@ from optics.study.stages import (
     fit_base,
     fit_from_cells,
     held_out_values,
+    lowest,
     null_models,
     off_neutral,
     settled,
@@ -523,7 +524,7 @@ def _extended(
             over=[v.name for v in extra],
         )
         if images:
-            best = cooled(model, best, setup.robust, progress)
+            best = lowest(model, cooled(model, best, setup.robust, progress), setup.robust, progress)
         best = settled(model, best, setup.robust, progress)
     if effect.file:  # a draft is written after the study began
         own = places.own_plugins(model.scene.registry)

@@ -9,6 +9,7 @@ import numpy as np
 
 from optics.captures.capture_set import group_of
 from optics.fit import calibrate
+from optics.fit.branches import over_branches
 from optics.fit.compare import Comparison, compare
 from optics.fit.model import value_of
 from optics.fit.result import Fit
@@ -91,8 +92,8 @@ def fit_base(
         robust=robust,
         progress=progress,
     )
-    if tempering:
-        found = cooled(model, found, robust, progress)
+    if model.captures.table is None:
+        found = lowest(model, cooled(model, found, robust, progress) if tempering else found, robust, progress)
     found = settled(model, found, robust, progress, tolerance)
     found.start = begun
     return found
@@ -141,7 +142,8 @@ def _together(
     dof = sum(int(model.usable(i).sum()) for i in fitted) - len(variables)
     weighed = tempered(variables, temperature(model, start, fitted, dof))
     options: dict[str, Any] = {"tolerance": TOGETHER, "negligible": SAME, "robust": robust, "progress": progress}
-    return cooled(model, calibrate.fit(model, weighed, start, fitted, **options), robust, progress)
+    found = cooled(model, calibrate.fit(model, weighed, start, fitted, **options), robust, progress)
+    return lowest(model, found, robust, progress)
 
 
 def settled(
@@ -187,6 +189,25 @@ def cooled(model: SceneModel, found: Fit, robust: bool = False, progress: Progre
     return found
 
 
+def lowest(model: SceneModel, found: Fit, robust: bool = False, progress: Progress | None = None) -> Fit:
+    """A fit of images, or the lower one from where single frames have a lower minimum."""
+
+    def follow(values: Values) -> Fit:
+        again = calibrate.fit(
+            model,
+            found.variables,
+            values,
+            found.frames,
+            tolerance=TOGETHER,
+            negligible=SAME,
+            robust=robust,
+            progress=progress,
+        )
+        return cooled(model, again, robust, progress)
+
+    return over_branches(model, found, follow)
+
+
 def off_neutral(model: SceneModel, values: Values, variables: Sequence[Variable]) -> Values:
     """Values with variables a tenth of their plausible size off: at a bound a one-sided onset has no slope to
     follow."""
@@ -200,7 +221,13 @@ def held_out_values(model: SceneModel, found: Fit, held: Sequence[int]) -> tuple
     """Values for all frames, and the number of variables fitted for it: on held-out frames only those with a value per
     frame or group are fitted."""
     own = calibrate.for_frames(model, found.variables, held)
-    return (calibrate.fit(model, own, found.values, held).values if own else found.values), len(own)
+    if not own:
+        return found.values, 0
+
+    def follow(values: Values) -> Fit:
+        return calibrate.fit(model, own, values, held)
+
+    return over_branches(model, follow(found.values), follow).values, len(own)
 
 
 def comparison_of(
