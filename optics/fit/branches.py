@@ -21,7 +21,7 @@ from optics.fit.result import Fit
 from optics.fit.tempering import weight_of
 from optics.scene.parameter import Values
 
-REACH = 4.0  # sd of the priors about their means: as far as errors of settings go
+REACH = 3.0  # sd of the priors about their means: as far as errors of settings go
 STEP = 0.25  # sd of the priors: of a walk
 TOLD = 4.0  # of what the prior tells: a frame that tells less has no minimum but the prior's
 FINE = 0.5  # sd of what is known along a walk, to which a minimum is found before everything is calibrated from there
@@ -144,16 +144,20 @@ class Walks:
         steps = np.arange(-REACH, REACH + STEP / 2, STEP)
         along = [self._misfits({f: w.middle + s for f, w in self.of.items()}, factor) for s in steps]
         minima = {f: w.middle + steps[_minima(w.middle + steps, [c[f] for c in along])] for f, w in self.of.items()}
-        lowest = self._narrowed({f: float(ts[0]) for f, ts in minima.items()}, factor)
+        if factor == 1:  # the fit is at its minima
+            lowest = {f: (misfit, 0.0) for f, misfit in self._misfits(dict.fromkeys(self.of, 0.0), factor).items()}
+        else:
+            lowest = self._narrowed({f: float(ts[0]) for f, ts in minima.items()}, factor)
         moved = set()
         for n in range(1, max(map(len, minima.values()))):
-            for f, one in self._narrowed({f: float(ts[n]) for f, ts in minima.items() if n < len(ts)}, factor).items():
-                if one[0] < lowest[f][0] - LOWER:
-                    lowest[f] = one
+            others = self._narrowed({f: float(ts[n]) for f, ts in minima.items() if n < len(ts)}, factor)
+            for f, other in others.items():
+                if other[0] < lowest[f][0] - LOWER:
+                    lowest[f] = other
                     moved.add(f)
         if not moved:
             return None
-        at = {f: t for f, (_, t) in lowest.items() if factor != 1 or f in moved}
+        at = {f: t for f, (_, t) in lowest.items()}
         return sum(misfit for misfit, _ in lowest.values()), self.moved(at, factor)
 
     def _narrowed(self, at: Places, factor: float) -> dict[int, tuple[float, float]]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -130,15 +131,17 @@ class Refits:
     def calibrated(self, variables: Sequence[Variable], extra: Sequence[Variable], frames: Sequence[int]) -> Fit:
         """The fit by chord steps, and where these have no end but come near the best, or were promised to, a
         calibration that continues them; where that falls short of what was promised, one from the study's start values:
-        a strong effect may have bent the base's values far from the truth."""
+        a strong effect may have bent the base's values far from the truth. What was promised as much as the best is
+        followed to its end, since where chord steps have stuck nothing more is promised."""
         quick = self.chord(extra)
         leader = max(map(self.fall, (*self.chords.values(), *self.results.values())))
-        if quick.converged or not max(self.fall(quick), quick.promised) > PROMISING * leader:
+        near, enough = PROMISING * leader, AS_PROMISED * quick.promised
+        if (quick.converged and self.fall(quick) > enough) or not max(self.fall(quick), quick.promised) > near:
             return quick
-        asked = self.minimised(self.base) - PROMISING * leader
+        asked = math.inf if quick.promised > near else self.minimised(self.base) - near
         longer = further(self.model, variables, quick.values, frames, asked=asked, negligible=self.coarse)
         best = min((longer, quick), key=self.minimised)
-        if self.fall(best) > AS_PROMISED * quick.promised or self.minimised(best) > asked:
+        if self.fall(best) > enough or self.minimised(best) > asked:
             return best
         values = off_neutral(self.model, Values(dict(self.setup.values)), extra)
         afresh = fit_base(self.model, variables, frames, values, tolerance=ROUGH, negligible=self.coarse)
