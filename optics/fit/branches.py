@@ -99,13 +99,9 @@ class Walks:
             return
         self.scales = {f: scale for f, (_, _, scale) in zip(found.frames, found.normal.rows)}
         weight = weight_of(found.variables)
-        own: dict[int, list[tuple[int, tuple[float, float]]]] = {}
-        for i, v in enumerate(found.variables):
-            if v.frames is not None and len(v.frames) == 1 and v.prior is not None and v.parameter.unit == "deg":
-                own.setdefault(v.frames[0], []).append((i, v.prior))
-        for f, angles in own.items():
-            places = tuple(i for i, _ in angles)
-            means, sds = np.array([prior for _, prior in angles]).T
+        for f, places in own_angles(found).items():
+            priors = [found.variables[i].prior for i in places]
+            means, sds = np.array([prior for prior in priors if prior is not None]).T
             told, directions = np.linalg.eigh(found.normal.a[np.ix_(places, places)] * np.outer(sds, sds))
             at = (np.array([value_of(model, found.values, found.variables[i]) for i in places]) - means) / sds
             if told[-1] > TOLD:
@@ -170,6 +166,15 @@ class Walks:
                 beside = {f: t + step for f, t in middles.items()}
                 best = {f: min(best[f], (misfit, beside[f])) for f, misfit in self._misfits(beside, factor).items()}
         return best
+
+
+def own_angles(found: Fit) -> dict[int, tuple[int, ...]]:
+    """Frame -> places of the angles with priors that it alone has."""
+    own: dict[int, tuple[int, ...]] = {}
+    for i, v in enumerate(found.variables):
+        if v.frames is not None and len(v.frames) == 1 and v.prior is not None and v.parameter.unit == "deg":
+            own[v.frames[0]] = (*own.get(v.frames[0], ()), i)
+    return own
 
 
 def _minima(t: np.ndarray, line: Sequence[float]) -> list[int]:

@@ -24,6 +24,7 @@ import numpy as np
 from optics.captures import capture_set as capture_files
 from optics.captures import identity
 from optics.diagnosis.dials import Width, unstated, width_of
+from optics.diagnosis.dials_at_extinction import at_extinction, width_of_angles
 from optics.diagnosis.refit import Expected
 from optics.diagnosis.result import Diagnosis, Row
 from optics.diagnosis.score import SETTLED
@@ -150,6 +151,14 @@ def _dial_error(model: SceneModel, setup: Setup) -> Width | None:
     # of the noise, held-out readings tell too: of few settings each is needed
     frames = list(range(len(model.frames))) if model.captures.table is not None else split(model, setup)[0]
     found = fit_base(model, variables_of_base(model, setup, frames), frames, Values(dict(setup.values)))
+    keys, values = unstated(model), Values(dict(setup.values))
+    if model.captures.table is None and at_extinction(model, found.values, keys, frames):
+
+        def calibrated(width: float) -> Fit:
+            free = open_model(own := replace(setup, uncertainty=dict.fromkeys(keys, width)))
+            return fit_base(free, variables_of_base(free, own, frames), frames, values, tempering=True)
+
+        return width_of_angles(calibrated)
     tested = candidates(model, None)
     seek(model, found.values, tested, frames)
     try:
