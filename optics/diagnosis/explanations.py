@@ -84,6 +84,7 @@ class Trial:
     cost       see the module
     deviance   see the module; NaN before the competition;   gain: what shared noise lowers it by
     readings   of a table, or frames of images, about it; None before
+    settled    chi2 of its priors beside a lamp, by the lamp (`_from_priors`)
     bare       whether it leaves no more of images than noise that is stated too small (MISSTATED), without structure,
                and a lamp that wanders unnoticed
     ahead      chi2 of the blocks that were left out in turn, less that of the base; NaN where it was not computed
@@ -102,6 +103,7 @@ class Trial:
     deviance: float = math.nan
     gain: float = 0.0
     readings: Readings | None = None
+    settled: dict[tuple[float, float], tuple[float, float]] = field(default_factory=dict)
     bare: bool = False
     ahead: float = math.nan
     refuted: str = ""
@@ -1043,9 +1045,29 @@ def _less_alike(case: Case, outcome: Outcome, fall: float, best: Trial, other: T
 
     What is known beforehand, as where a dial stood, is no image: it does not scatter between parts of one, and counts
     once, however often it counted in the fit."""
-    weighed = case.prior_chi2(other.fit.values) - case.prior_chi2(best.fit.values)
-    known = case.known_chi2(other.fit.values) - case.known_chi2(best.fit.values)
-    return (fall - weighed) / design_effect(case, outcome, best, other) + known
+    (weighed, known), (weighed_best, known_best) = (_from_priors(case, outcome, t) for t in (other, best))
+    return (fall - (weighed - weighed_best)) / design_effect(case, outcome, best, other) + known - known_best
+
+
+def _from_priors(case: Case, outcome: Outcome, trial: Trial) -> tuple[float, float]:
+    """(chi2 of the priors as they are weighed, chi2 with each counted once) of an explanation beside what a lamp made
+    of the images: a dial that went far off for the lamp's sake is not held against it as well."""
+    values, lamp = trial.fit.values, case.lamp
+    if lamp is not None and not trial.by_frame and trial.gain > 0:
+        key = (outcome.scale, lamp.most)
+        if key not in trial.settled:
+            noise = _of_frames(case, lamp, trial).noise(outcome.scale)
+            evidence, values = case.evidence, values.copy()
+            base = [evidence.columns[i] for i in evidence.base]
+            columns = evidence.dense([*evidence.base, *(i for c in trial.members for i in c.columns)])
+            known = priors(case.model, values, base)
+            steps = lamp.settled(np.concatenate(_kept(case, trial.images)), columns, known, noise)
+            for v, step in zip(base, steps):
+                if v.prior is not None:
+                    values.put(v, value_of(case.model, values, v) + float(step))
+            trial.settled[key] = case.prior_chi2(values), case.known_chi2(values)
+        return trial.settled[key]
+    return case.prior_chi2(values), case.known_chi2(values)
 
 
 def _kept(case: Case, images: Sequence[np.ndarray]) -> list[np.ndarray]:

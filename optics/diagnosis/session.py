@@ -18,6 +18,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy import linalg
 
+from optics.diagnosis import statistics as st
 from optics.diagnosis.correlation import Correlation, Readings, of_rms_1, whitened
 from optics.diagnosis.evidence import Evidence, known_products
 from optics.fit.model import Model
@@ -104,26 +105,42 @@ class Frames:
         self, residual: np.ndarray, fitted: np.ndarray, known: tuple[np.ndarray, np.ndarray] | None = None
     ) -> Readings:
         """As of `Session`: the dial of a frame that is known to a degree does not take up what a lamp did there."""
-        whole = np.column_stack([fitted, residual])
-        parts = np.split(whole, np.cumsum([len(g) for g in self.signal])[:-1])
-        along = np.array([g @ part for g, part in zip(self.signal, parts)]) * np.sqrt(self.thinning)
-        across = self.thinning * whole.T @ whole - along.T @ along
-        order, more = np.arange(len(along)), self.thinning * len(whole) - len(along)
+        along, across = self._parts(residual, fitted)
+        order, more = np.arange(len(along)), self.thinning * len(residual) - len(along)
         precision, pull = known or self.known
         across += known_products(precision, pull, fitted.shape[1])
         own = np.flatnonzero(precision)
         more += len(own)
         return Readings(along[:, -1], along[:, :-1], order, self.loads, across, more, APART, self.most, own)
 
+    def settled(
+        self, residual: np.ndarray, fitted: np.ndarray, known: tuple[np.ndarray, np.ndarray], noise: Correlation
+    ) -> np.ndarray:
+        """(k,) by how much what was fitted moves where a lamp made so much of the residual."""
+        along, products = self._parts(residual, fitted)
+        products += along.T @ (along / (1 + self._shared(noise))[:, None]) + known_products(*known, fitted.shape[1])
+        return st.inverse(products[:-1, :-1])[0] @ products[:-1, -1]
+
     def independent(self, columns: Sequence[np.ndarray], noise: Correlation) -> list[np.ndarray]:
         """Of each frame, (n,) or (n, k) values in units of the noise, with what its lamp may have done weighed down: as
         of frames that share nothing with each other."""
-        bright = float(np.mean(np.square(self.loads["lamp"]))) if len(self.signal) else 1.0
-        shared = noise.power * np.square(self.loads["lamp"]) / max(bright, 1e-300)
         return [
             c - (1 - 1 / math.sqrt(1 + p)) * np.multiply.outer(g, g @ c)
-            for c, g, p in zip(columns, self.signal, shared)
+            for c, g, p in zip(columns, self.signal, self._shared(noise))
         ]
+
+    def _parts(self, residual: np.ndarray, fitted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(frames, k + 1) images and residual along the signal of each frame, and their (k + 1, k + 1) products across
+        it."""
+        whole = np.column_stack([fitted, residual])
+        parts = np.split(whole, np.cumsum([len(g) for g in self.signal])[:-1])
+        along = np.array([g @ part for g, part in zip(self.signal, parts)]) * np.sqrt(self.thinning)
+        return along, self.thinning * whole.T @ whole - along.T @ along
+
+    def _shared(self, noise: Correlation) -> np.ndarray:
+        """(frames,) variance of a noise along the signal of each frame, in units of what nothing shares."""
+        bright = float(np.mean(np.square(self.loads["lamp"]))) if len(self.signal) else 1.0
+        return noise.power * np.square(self.loads["lamp"]) / max(bright, 1e-300)
 
 
 def _shared_errors(model: Model, evidence: Evidence) -> list[tuple[np.ndarray, np.ndarray]]:
