@@ -10,11 +10,13 @@ many frames, and is walked too. Only angles are walked: only they have two sides
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain, product
 
 import numpy as np
 
+from optics.fit import calibrate
 from optics.fit.descent import whiten
 from optics.fit.model import Model, value_of
 from optics.fit.result import Fit
@@ -44,7 +46,8 @@ def over_branches(model: Model, found: Fit, follow: Callable[[Values], Fit]) -> 
 
     follow   calibrates all variables of the fit from given values"""
     for _ in range(ROUNDS):
-        for values in Walks(model, found).lower():
+        walks = Walks(model, found)
+        for values in chain(walks.lower(), walks.turned_round()):
             other = follow(values)
             if other.total < found.total - LOWER:
                 found = other
@@ -114,6 +117,28 @@ class Walks:
         known = [self.found.sd[i] / max(self.found.estimate[i], 1e-300) for i in self.powers]
         vague = max(known, default=0.0) > VAGUE
         return [v for _, v in sorted(filter(None, map(self._lowest, FACTORS if vague else (1.0,))), key=lambda t: t[0])]
+
+    def turned_round(self) -> Iterator[Values]:
+        """Values with what several angles of a frame are off from their settings turned round, some of them or all,
+        where the frame by itself is lower then: a sheet between crossed films has extinctions of its own."""
+        found, lower = self.found, False
+        values = found.values.copy()
+        for f, walk in self.of.items():
+            own = [found.variables[i] for i in walk.places]
+            off = walk.sds * walk.at
+            starts = [walk.means + off * signs for signs in product((1, -1), repeat=len(own))] if len(own) > 1 else []
+            least = math.inf
+            for n, start in enumerate(starts):
+                there = found.values.copy()
+                for v, angle in zip(own, start):
+                    there.put(v, float(np.clip(angle, *v.parameter.bounds)))
+                ended = calibrate.fit(self.model, own, there, [f])
+                if ended.total < least - LOWER * (n > 0):
+                    least, lower = ended.total, lower or n > 0
+                    for v, angle in zip(own, ended.estimate):
+                        values.put(v, float(angle))
+        if lower:
+            yield values
 
     def moved(self, at: Places, factor: float = 1.0) -> Values:
         """The values of the fit with the angles of some frames elsewhere, and with so many times the light."""
