@@ -9,10 +9,12 @@ import pytest
 
 from optics.diagnosis import diagnose, explanations, findings, held_out, laws, refit, score
 from optics.diagnosis import statistics as st
-from optics.diagnosis.correlation import NOTICED, Readings
+from optics.diagnosis.correlation import NOTICED, Correlation, Readings
 from optics.diagnosis.result import Law
+from optics.diagnosis.session import Frames
 from optics.diagnosis.thresholds import TOLD
 from optics.scene import registry
+from optics.scene.parameter import Values
 
 
 def form(name, information, fall):
@@ -43,7 +45,7 @@ def test_what_is_known_of_dials_counts_whole_in_a_fall_and_once(monkeypatch, wei
     best, without = (SimpleNamespace(fit=SimpleNamespace(values=v)) for v in (1.0, 21.0))
     outcome = SimpleNamespace(best=best, without=lambda *a: without, own_fall=lambda *a: 2.0 + 20.0 * weight)
     case = SimpleNamespace(
-        evidence=SimpleNamespace(is_table=False), prior_chi2=lambda v: weight * v, known_chi2=lambda v: v
+        lamp=None, evidence=SimpleNamespace(is_table=False), prior_chi2=lambda v: weight * v, known_chi2=lambda v: v
     )
     assert explanations.fall_over_noise(case, outcome, "a") == pytest.approx(20.2)
 
@@ -181,7 +183,7 @@ def test_a_lamp_rules_out_nothing_that_leaves_less_where_misfit_is_left(monkeypa
 
     best, other = trial("a", 1e4, 9e3, 2.97e6, 47.0), trial("b", 1.1e4, 2e3, fall, cost)
     evidence = SimpleNamespace(is_table=False, normal=SimpleNamespace(count=20000), projected=SimpleNamespace(rank=20))
-    case = SimpleNamespace(evidence=evidence, prior_chi2=lambda values: 0.0, known_chi2=lambda values: 0.0)
+    case = SimpleNamespace(lamp=None, evidence=evidence, prior_chi2=lambda values: 0.0, known_chi2=lambda values: 0.0)
     monkeypatch.setattr(explanations, "design_effect", lambda *a: 1.0)
     lead, needed = explanations._lead(case, SimpleNamespace(scale=scale), best, other)
     assert (lead > needed) is ruled_out
@@ -199,9 +201,8 @@ def test_what_leaves_an_unnoticed_lamp_is_a_rival_of_gains_of_each_frame(monkeyp
         return SimpleNamespace(**values, cost=20.0, complete=True, bare=bare, fit=SimpleNamespace(values=0.0))
 
     best, other = trial("gains", 1000.0, 0.0, True), trial("detector", 1003.0, 997.0, False)
-    case = SimpleNamespace(
-        evidence=SimpleNamespace(is_table=False), prior_chi2=lambda values: 0.0, known_chi2=lambda values: 0.0
-    )
+    evidence = SimpleNamespace(is_table=False)
+    case = SimpleNamespace(lamp=None, evidence=evidence, prior_chi2=lambda values: 0.0, known_chi2=lambda values: 0.0)
     monkeypatch.setattr(explanations, "design_effect", lambda *a: 1.0)
     outcome = SimpleNamespace(scale=1.0, base=SimpleNamespace(deviance=1003.0 + brings))
     lead, needed = explanations._lead(case, outcome, best, other)
@@ -220,11 +221,57 @@ def test_misfit_that_is_left_beside_gains_of_each_frame_is_counted_without_a_lam
     best = trial(1130.0, 0.0, 2900.0, True, {"gains", "offset"})
     other = trial(1180.0, 2070.0, 0.0, False, {"offset"})
     evidence = SimpleNamespace(is_table=False, normal=SimpleNamespace(count=1000), projected=SimpleNamespace(rank=20))
-    case = SimpleNamespace(evidence=evidence, prior_chi2=lambda values: 0.0, known_chi2=lambda values: 0.0)
+    case = SimpleNamespace(lamp=None, evidence=evidence, prior_chi2=lambda values: 0.0, known_chi2=lambda values: 0.0)
     monkeypatch.setattr(explanations, "design_effect", lambda *a: 1.0)
     monkeypatch.setattr(explanations, "_significant", lambda *a: 20.0)
     lead, needed = explanations._lead(case, SimpleNamespace(scale=1.37), best, other)
     assert lead > needed
+
+
+def test_beside_a_lamp_settings_move_as_least_squares_with_its_covariance_does():
+    """Three frames of one dial each; V = 1 + p g g' of each, with g its signal of length 1."""
+    rng = np.random.default_rng(5)
+    lamp = Frames.__new__(Frames)
+    sizes, loads = (6, 5, 7), np.array([40.0, 10.0, 25.0])
+    lamp.signal = [g / np.linalg.norm(g) for g in (1 + rng.random(n) for n in sizes)]
+    lamp.thinning, lamp.loads = 1.0, {"lamp": loads}
+    ends = np.cumsum([0, *sizes])
+    images = np.zeros((ends[-1], 3))
+    for k, (start, end) in enumerate(zip(ends, ends[1:])):
+        images[start:end, k] = 30 * lamp.signal[k] + rng.standard_normal(end - start)
+    residual = rng.standard_normal(len(images)) * 5
+    precision, pull = np.array([4.0, 0.0, 9.0]), np.array([-12.0, 0.0, 27.0])
+    noise = Correlation(1.0, 50.0, 1.0, "lamp", 10.0)
+    inverse = np.eye(len(images))
+    for start, end, g, load in zip(ends, ends[1:], lamp.signal, loads):
+        power = noise.power * load**2 / np.mean(loads**2)
+        inverse[start:end, start:end] = np.linalg.inv(np.eye(end - start) + power * np.outer(g, g))
+    expected = np.linalg.solve(images.T @ inverse @ images + np.diag(precision), images.T @ inverse @ residual + pull)
+    assert lamp.settled(residual, images, (precision, pull), noise) == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("gain, chi2", [(900.0, 4.0), (0.0, 64.0)])
+def test_a_dial_that_a_lamp_sent_far_off_counts_where_it_would_stand_beside_it(monkeypatch, gain, chi2):
+    """A dial that is known to .5 deg stands 4 deg off, and would stand 1 deg off beside a lamp that swings."""
+    dial = SimpleNamespace(prior=(0.0, 0.5))
+    values = Values({"dial": 4.0})
+    monkeypatch.setattr(Values, "put", lambda self, v, value: self.common.update(dial=value))
+    monkeypatch.setattr(explanations, "value_of", lambda model, values, v: values.common["dial"])
+    monkeypatch.setattr(explanations, "priors", lambda *a: None)
+    monkeypatch.setattr(explanations, "_kept", lambda *a: [np.zeros(1)])
+    monkeypatch.setattr(explanations, "_of_frames", lambda *a: SimpleNamespace(noise=lambda scale: None))
+
+    def known(values):
+        return (values.common["dial"] / 0.5) ** 2
+
+    evidence = SimpleNamespace(columns=[dial], base=[0], dense=lambda columns: np.zeros((1, 1)))
+    lamp = SimpleNamespace(most=math.inf, settled=lambda *a: np.array([-3.0]))
+    own = {"lamp": lamp, "evidence": evidence, "model": None}
+    case = SimpleNamespace(**own, known_chi2=known, prior_chi2=lambda values: 10 * known(values))
+    fit = SimpleNamespace(values=values)
+    trial = SimpleNamespace(fit=fit, by_frame=False, gain=gain, settled={}, members=[], images=[])
+    assert explanations._from_priors(case, SimpleNamespace(scale=1.0), trial) == (10 * chi2, chi2)
+    assert values.common["dial"] == 4.0
 
 
 @pytest.mark.parametrize("known, fall, better", [(None, 5.0, True), (None, -2e6, False), (9.0, 5.0, False)])
