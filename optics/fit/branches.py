@@ -30,13 +30,7 @@ FINE = 0.5  # sd of what is known along a walk, to which a minimum is found befo
 LOWER = 1.0  # of chi2, by which another minimum must be lower: rounding is not
 ROUNDS = 12  # of walks and calibrations, each of which goes down
 VAGUE = 0.03  # relative sd of the light, from which the sides of all frames may be wrong together
-FACTORS = (
-    1.0,
-    2.0,
-    0.5,
-    4.0,
-    0.25,
-)  # of the light that are tried then: a frame twice as bright is 0.7 times as far off
+FACTORS = (1.0, 2.0, 0.5, 4.0, 0.25)  # of the light, tried then: beside twice as much a frame is 0.7 times as far off
 
 Places = Mapping[int, float]  # frame -> t, sd of the priors from where its angles stand
 
@@ -89,7 +83,8 @@ class Walk:
 
 
 class Walks:
-    """The walks of all frames of a fit that tell of angles with priors which no other frame has.
+    """The walks of all frames of a fit that tell of angles with priors which no other frame has; none where predictions
+    are Monte Carlo estimates, of which a walk would take minutes.
 
     of       frame -> its walk
     powers   places of the variables that all light is proportional to
@@ -98,7 +93,7 @@ class Walks:
     def __init__(self, model: Model, found: Fit):
         self.model, self.found, self.of = model, found, dict[int, Walk]()
         self.powers = [i for i, v in enumerate(found.variables) if v.frames is None and model.linear_in(v)]
-        if found.normal is None:
+        if found.normal is None or model.monte_carlo:
             return
         self.scales = {f: scale for f, (_, _, scale) in zip(found.frames, found.normal.rows)}
         weight = weight_of(found.variables)
@@ -197,7 +192,7 @@ def own_angles(found: Fit) -> dict[int, tuple[int, ...]]:
     """Frame -> places of the angles with priors that it alone has."""
     own: dict[int, tuple[int, ...]] = {}
     for i, v in enumerate(found.variables):
-        if v.frames is not None and len(v.frames) == 1 and v.prior is not None and v.parameter.unit == "deg":
+        if v.frames is not None and len(v.frames) == 1 and v.prior is not None and v.parameter.role == "angle":
             own[v.frames[0]] = (*own.get(v.frames[0], ()), i)
     return own
 
