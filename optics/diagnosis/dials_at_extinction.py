@@ -5,9 +5,11 @@ are off: it has no slope at the settings, on which `optics.diagnosis.dials` rest
 calibrated with a width that is assumed, and the width follows from where they end: of a component u of an image's
 angles (deg from the settings) that it tells to 1/sqrt(l)
 
-    -2 ln L(w) = sum over components of  ln(1 + w^2 l) + u^2 l / (1 + w^2 l)
+    u = t'(e + m) + n,  var n = 1/l;    e: the errors, of variance w^2;  m: a zero of each dial
 
-with the prior of `optics.diagnosis.dials`. A few turns of that end where the width that is found is the one assumed."""
+and the width is that of the largest likelihood, with the prior of `optics.diagnosis.dials`. A zero that is off is an
+effect, and no error of the settings: all zeros within ZERO are as likely. A few turns of that end where the width that
+is found is the one assumed."""
 
 from __future__ import annotations
 
@@ -23,6 +25,7 @@ from optics.scene.parameter import Values
 
 TURNS = 4  # calibrations
 SAME = 0.1  # of a width: a change that is smaller is none
+ZERO = 10.0  # deg: zeros of dials that may be
 
 
 def at_extinction(model: SceneModel, values: Values, keys: Sequence[str], frames: Sequence[int]) -> bool:
@@ -59,19 +62,30 @@ def width_of_angles(calibrated: Callable[[float], Fit]) -> Width | None:
 def width_in(fit: Fit) -> Width | None:
     """The width by the angles of one calibration."""
     assert fit.normal is not None
-    u, told = [], []
+    u, noise, zeros = [], [], []
+    keys = list(dict.fromkeys(fit.variables[i].keys for places in own_angles(fit).values() for i in places))
     for places in own_angles(fit).values():
         variables = [fit.variables[i] for i in places]
         priors = np.array([v.precision for v in variables])
         information, turn = np.linalg.eigh(fit.normal.a[np.ix_(places, places)] - np.diag(priors))
         middles = np.array([v.prior[0] for v in variables if v.prior is not None])
-        off = turn.T @ (np.array([fit.estimate[i] for i in places]) - middles)
-        seen = information > priors.max()  # the rest stands where the prior has put it
-        u += list(off[seen] * (1 + priors.max() / information[seen]))  # without the prior's pull
-        told += list(information[seen])
-    square, each = np.square(u), np.asarray(told)
-    if not len(each):
+        off = turn.T @ (fit.estimate[list(places)] - middles)
+        of_dial = np.array([[float(v.keys == key) for key in keys] for v in variables])
+        for told, one, to in zip(information, off, turn.T @ of_dial):
+            if told > priors.max():  # the rest stands where the prior has put it
+                u.append(one * (1 + priors.max() / told))  # without the prior's pull
+                noise.append(1 / told)
+                zeros.append(to)
+    if len(u) <= len(keys):
         return None
-    ratios = 1 + WIDTHS[:, None] ** 2 * each
-    likelihood = -(np.log(ratios) + square * each / ratios).sum(1) - unlikely(WIDTHS)
-    return most_likely([Profile(likelihood, WIDTHS)])
+    likelihood = np.array([_likelihood(np.array(u), np.array(noise) + w**2, np.array(zeros)) for w in WIDTHS])
+    return most_likely([Profile(likelihood - unlikely(WIDTHS), WIDTHS)])
+
+
+def _likelihood(u: np.ndarray, variance: np.ndarray, zeros: np.ndarray) -> float:
+    """Twice the log likelihood of u, of variances of their own and with zeros' (n, k) of variance ZERO^2 in common."""
+    weighed = zeros / variance[:, None]
+    inner = np.eye(zeros.shape[1]) / ZERO**2 + zeros.T @ weighed
+    along = weighed.T @ u
+    square = float(u @ (u / variance) - along @ np.linalg.solve(inner, along))
+    return -(square + float(np.log(variance).sum() + np.linalg.slogdet(inner)[1]))

@@ -1,11 +1,13 @@
 """Errors of dials that nobody states: found by their likelihood, and not mistaken for effects, nor effects for them."""
 
+import math
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from optics.diagnosis.dials import LOOSE, Products, most_likely
+from optics.diagnosis.dials_at_extinction import width_in
 from optics.diagnosis.session import _whitening
 from optics.diagnosis.thresholds import EACH
 
@@ -155,3 +157,36 @@ def test_effects_that_take_up_all_together_do_so_one_at_a_time():
         )
     assert sum(f is not None and 0.25 < f.sd < 1.0 for f in each) >= 8
     assert sum(f is not None for f in together) < 2
+
+
+def ended(rng, width, zero, assumed=0.5, frames=9, told=400.0):
+    """A calibration of photographs between crossed films, each of which tells the difference of two dials to 1/20 deg:
+    both stand between it and their settings, as the assumed width has it."""
+    variables, estimate, normal = [], [], np.zeros((2 * frames, 2 * frames))
+    apart, prior = np.array([-1.0, 1.0]) / math.sqrt(2), np.eye(2) / assumed**2
+    for f in range(frames):
+        seen = apart @ (width * rng.standard_normal(2) + [0.0, zero]) + rng.standard_normal() / math.sqrt(told)
+        information = told * np.outer(apart, apart) + prior
+        normal[2 * f : 2 * f + 2, 2 * f : 2 * f + 2] = information
+        estimate += list(np.linalg.solve(information, told * apart * seen))
+        known = {"prior": (0.0, assumed), "precision": 1 / assumed**2, "parameter": SimpleNamespace(role="angle")}
+        variables += [SimpleNamespace(keys=(key,), frames=(f,), **known) for key in ("polarizer", "analyzer")]
+    return SimpleNamespace(variables=variables, estimate=np.array(estimate), normal=SimpleNamespace(a=normal))
+
+
+@pytest.mark.parametrize("zero", [0.0, 3.0])
+def test_between_crossed_films_the_width_follows_from_where_angles_end_and_no_zero_is_taken_for_it(zero):
+    """Of nine differences a width is known to a quarter; of sixty sets its mean to a thirtieth. The prior draws it down
+    by a tenth."""
+    rng = np.random.default_rng(0)
+    found = [width_in(ended(rng, 0.6, zero)).sd for _ in range(60)]
+    assert 0.85 < np.mean(found) / 0.6 < 1.02
+    assert np.std(found) / 0.6 < 0.28
+
+
+def test_exact_dials_between_crossed_films_have_no_width():
+    """Chance brings twice the log likelihood of one exact bench in six above 1, and a width of a tenth of a degree."""
+    rng = np.random.default_rng(1)
+    found = [width_in(ended(rng, 0.0, 1.0)) for _ in range(60)]
+    assert sum(w is not None for w in found) < 20
+    assert all(w.sd < 0.1 for w in found if w is not None)
