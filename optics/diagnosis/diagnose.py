@@ -25,6 +25,7 @@ from optics.diagnosis import fingerprints as prints
 from optics.diagnosis import held_out as held
 from optics.diagnosis import statistics as st
 from optics.diagnosis.decide import Findings, decide
+from optics.diagnosis.dials_as_rival import with_rivals
 from optics.diagnosis.evidence import Candidate, Progress, silent
 from optics.diagnosis.explanations import Outcome
 from optics.diagnosis.findings import basis_of, findings_of, followed, subject_of
@@ -162,6 +163,7 @@ def diagnose(
             again.warnings.append(cooled.remark)
             return again
     outcome, levels = held.judge(case, explanations.search(case, chosen, fits))
+    outcome = with_rivals(case, outcome)
     chosen += [c for c in table.order if c.effect.name in fits and c not in chosen]
     subject, best = subject_of(case, outcome), outcome.best
 

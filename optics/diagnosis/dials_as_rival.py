@@ -14,10 +14,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from optics.diagnosis.dials import WIDTHS, unlikely
+from optics.diagnosis.dials import WIDTHS, unlikely, unstated
 from optics.diagnosis.evidence import Candidate
 from optics.diagnosis.explanations import Outcome, Trial, cost_of, design_effect, implausible
 from optics.diagnosis.refit import FAILURES, Case, chi2, further
+from optics.diagnosis.thresholds import SURE
 from optics.fit.model import value_of
 from optics.fit.result import Fit
 from optics.fit.scene_model import SceneModel
@@ -25,20 +26,43 @@ from optics.scene.declare import Effect
 from optics.scene.parameter import Values, Variable
 
 ERRORS = Effect("errors of dials", part="layer", parameters=(), scope="frame")
+ASKED = 3  # explanations of one effect, the best of those without a strength per frame, that are tried with the errors
 STEPS = 2  # calibrations, each of FEW linearisations, that the errors may take: they may be far from where dials stand
 
 
 def lead_over(case: Case, outcome: Outcome, subject: Candidate, keys: Sequence[str]) -> float:
     """By how much the best explanation is ahead, in score, of itself with errors of dials in place of one of its
     effects; minus infinity where these cannot be fitted."""
+    values = outcome.best.fit.values.copy()
+    for v, at in zip(subject.variables, subject.start):
+        values.put(v, float(at))
+    return _lead_over_errors(case, outcome, [c for c in outcome.best.members if c is not subject], values, keys)
+
+
+def with_rivals(case: Case, outcome: Outcome) -> Outcome:
+    """The outcome in which explanations without a strength per frame survive, if errors of dials that nobody states
+    bring them as near to the best one, which is such strengths, as a claim forbids. By themselves they are ruled out:
+    what the dials did to each frame, the strengths explain as well."""
+    best, model = outcome.best, case.model
+    if case.evidence.is_table or len(best.members) != 1 or not best.by_frame or not isinstance(model, SceneModel):
+        return outcome
+    keys = unstated(model)
+    alone = [t for t in outcome.trials if len(t.members) == 1 and not t.by_frame and t not in outcome.survivors]
+    for t in alone[:ASKED] if keys else []:
+        if _lead_over_errors(case, outcome, t.members, t.fit.values.copy(), keys) <= SURE:
+            t.dials = " and ".join(keys)
+            outcome.survivors.append(t)
+    return outcome
+
+
+def _lead_over_errors(
+    case: Case, outcome: Outcome, others: Sequence[Candidate], values: Values, keys: Sequence[str]
+) -> float:
+    """By how much the best explanation is ahead of some effects with errors of dials, fitted from these values."""
     model, best = case.model, outcome.best
     assert isinstance(model, SceneModel)
     doubted = [v for key in keys for v in _of_each(model, key, case.fitted)]
-    others = [c for c in best.members if c is not subject]
     known = [v for v in case.base if not (v.frames is not None and set(v.keys) & set(keys))]
-    values = best.fit.values.copy()
-    for v, at in zip(subject.variables, subject.start):
-        values.put(v, float(at))
     wanted = [*known, *(v for c in others for v in c.variables), *doubted]
     try:
         for _ in range(STEPS):

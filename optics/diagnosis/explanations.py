@@ -89,6 +89,7 @@ class Trial:
                and a lamp that wanders unnoticed
     ahead      chi2 of the blocks that were left out in turn, less that of the base; NaN where it was not computed
     refuted    what rules it out besides its score, in words; '' for nothing
+    dials      whose errors, which nobody states, it needs to survive (`optics.diagnosis.dials_as_rival`); '' for none
     """
 
     members: list[Candidate]
@@ -107,6 +108,7 @@ class Trial:
     bare: bool = False
     ahead: float = math.nan
     refuted: str = ""
+    dials: str = ""
 
     @property
     def names(self) -> frozenset[str]:
@@ -222,6 +224,7 @@ class Outcome:
                     same_as=same.get(t.names, ""),
                     larger=t in self.larger,
                     refuted=t.refuted if t in self.refuted else "",
+                    dials=t.dials,
                     values=t.fit.values.record() if len(t.members) > 1 and t in [*self.survivors, *self.larger] else {},
                 )
             )

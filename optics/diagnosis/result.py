@@ -106,6 +106,7 @@ class Explanation:
                  captures can tell the two apart, however often it is taken again; '' for none
     larger       whether it contains one that survives, and has a better score: likelier, but not shown to be needed
     refuted      what rules it out besides its score, in words; '' for nothing
+    dials        whose errors, which captures do not state, it needs to survive; '' for none
     values       {"common": ..., "frame": ...} of its fit, where it is possible and has several effects: once one of
                  them is added, the next diagnosis looks for the others there
     """
@@ -127,6 +128,7 @@ class Explanation:
     same_as: str = ""
     larger: bool = False
     refuted: str = ""
+    dials: str = ""
     values: dict[str, dict] = field(default_factory=dict, repr=False)
 
     @property

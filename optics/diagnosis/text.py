@@ -263,6 +263,12 @@ def _ambiguous(f: Findings, explanations: Sequence[Explanation]) -> str:
     names = ", or ".join(_kind(kind) for kind in kinds)
     count = len(kinds)
     other = f" By other weights or masks {f.fragile} does better." if f.fragile else ""
+    doubted = [e for e in explanations if e.survives and e.dials]
+    if doubted:
+        other += (
+            f" {' or '.join(e.name for e in doubted)} explains as much only with errors of {doubted[0].dials}, which "
+            "the captures do not state."
+        )
     if f.untried:
         other += f" By its score {f.untried[0]} may explain more, and was not calibrated."
     if f.weighed and f.share < MOST:
