@@ -49,7 +49,7 @@ def with_rivals(case: Case, outcome: Outcome) -> Outcome:
     keys = unstated(model)
     alone = [t for t in outcome.trials if len(t.members) == 1 and not t.by_frame and t not in outcome.survivors]
     for t in alone[:ASKED] if keys else []:
-        if _lead_over_errors(case, outcome, t.members, t.fit.values.copy(), keys) <= SURE:
+        if -math.inf < _lead_over_errors(case, outcome, t.members, t.fit.values.copy(), keys) <= SURE:
             t.dials = " and ".join(keys)
             outcome.survivors.append(t)
     return outcome

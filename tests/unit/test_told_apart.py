@@ -7,12 +7,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from optics.diagnosis import diagnose, explanations, findings, held_out, laws, refit, score
+from optics.diagnosis import diagnose, dials_as_rival, explanations, findings, held_out, laws, refit, score
 from optics.diagnosis import statistics as st
 from optics.diagnosis.correlation import NOTICED, Correlation, Readings
 from optics.diagnosis.result import Law
 from optics.diagnosis.session import Frames
 from optics.diagnosis.thresholds import TOLD
+from optics.fit.scene_model import SceneModel
 from optics.scene import registry
 from optics.scene.parameter import Values
 
@@ -272,6 +273,24 @@ def test_a_dial_that_a_lamp_sent_far_off_counts_where_it_would_stand_beside_it(m
     trial = SimpleNamespace(fit=fit, by_frame=False, gain=gain, settled={}, members=[], images=[])
     assert explanations._from_priors(case, SimpleNamespace(scale=1.0), trial) == (10 * chi2, chi2)
     assert values.common["dial"] == 4.0
+
+
+@pytest.mark.parametrize("lead, survives", [(5.0, True), (30.0, False), (-math.inf, False)])
+def test_effects_beside_errors_of_dials_are_rivals_of_gains_of_each_frame(monkeypatch, lead, survives):
+    """By itself a polarized detector is ruled out; with errors of dials that nobody states it is behind by `lead`.
+    Where these could not be fitted it stays ruled out, and so does what has a strength per frame itself."""
+
+    def trial(name, by_frame):
+        return SimpleNamespace(members=[name], by_frame=by_frame, dials="", fit=SimpleNamespace(values=Values({})))
+
+    gains, detector, steps = trial("gains", True), trial("detector", False), trial("steps", True)
+    outcome = SimpleNamespace(best=gains, trials=[gains, detector, steps], survivors=[gains])
+    case = SimpleNamespace(evidence=SimpleNamespace(is_table=False), model=SceneModel.__new__(SceneModel))
+    monkeypatch.setattr(dials_as_rival, "unstated", lambda model: ["analyzer.angle"])
+    monkeypatch.setattr(dials_as_rival, "_lead_over_errors", lambda *a: lead)
+    found = dials_as_rival.with_rivals(case, outcome)
+    assert found.survivors == ([gains, detector] if survives else [gains])
+    assert detector.dials == ("analyzer.angle" if survives else "")
 
 
 @pytest.mark.parametrize("known, fall, better", [(None, 5.0, True), (None, -2e6, False), (9.0, 5.0, False)])
