@@ -4,7 +4,7 @@ Images are taken one by one, and a film that is turned between them stops a litt
 captures do not say how far, an error of each frame explains what a gain of each frame does; but not as well: a turned
 film must be turned far to halve what passes, and whoever turns it reads its scale. So the errors are fitted in place of
 the effect, of a width that is sought, and held against it as any explanation is (`optics.diagnosis.explanations`); the
-width is as likely as `optics.diagnosis.dials` says."""
+width is as likely as `optics.diagnosis.dials` says. So are other effects with these errors."""
 
 from __future__ import annotations
 
