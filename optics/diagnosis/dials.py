@@ -18,7 +18,8 @@ effects change slowly along a dial or along the session, and errors of single se
 Of images that are taken one by one, a gain of each frame is as sudden as a dial. Its size is sought besides, and the
 width has a prior: at the turning points of the light a dial shows nothing, and no dial is off by so much that half as
 much light passes. Images have few settings, and all effects together would take up any error of a dozen: L holds one
-effect at a time, or none, and the likeliest counts.
+effect at a time, or none, and the likeliest counts. Where films stand crossed in most images, slopes tell nothing: see
+`optics.diagnosis.dials_at_extinction`.
 
 Source: Patterson & Thompson, Recovery of inter-block information when block sizes are unequal, Biometrika 58, 545
 (1971)."""
