@@ -63,8 +63,9 @@ def width_in(fit: Fit) -> Width | None:
     """The width by the angles of one calibration."""
     assert fit.normal is not None
     u, noise, zeros = [], [], []
-    keys = list(dict.fromkeys(fit.variables[i].keys for places in own_angles(fit).values() for i in places))
-    for places in own_angles(fit).values():
+    angles = own_angles(fit).values()
+    keys = list(dict.fromkeys(fit.variables[i].keys for places in angles for i in places))
+    for places in angles:
         variables = [fit.variables[i] for i in places]
         priors = np.array([v.precision for v in variables])
         information, turn = np.linalg.eigh(fit.normal.a[np.ix_(places, places)] - np.diag(priors))

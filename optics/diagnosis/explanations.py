@@ -1059,13 +1059,9 @@ def _from_priors(case: Case, outcome: Outcome, trial: Trial) -> tuple[float, flo
     if lamp is not None and not trial.by_frame and trial.gain > 0:
         key = (outcome.scale, lamp.most)
         if key not in trial.settled:
-            noise = _of_frames(case, lamp, trial).noise(outcome.scale)
-            evidence, values = case.evidence, values.copy()
-            base = [evidence.columns[i] for i in evidence.base]
-            columns = evidence.dense([*evidence.base, *(i for c in trial.members for i in c.columns)])
-            known = priors(case.model, values, base)
-            steps = lamp.settled(np.concatenate(_kept(case, trial.images)), columns, known, noise)
-            for v, step in zip(base, steps):
+            noise, values = _of_frames(case, lamp, trial).noise(outcome.scale), values.copy()
+            steps = lamp.settled(*_read(case, trial), noise)
+            for v, step in zip((case.evidence.columns[i] for i in case.evidence.base), steps):
                 if v.prior is not None:
                     values.put(v, value_of(case.model, values, v) + float(step))
             trial.settled[key] = case.prior_chi2(values), case.known_chi2(values)
@@ -1094,11 +1090,16 @@ def _of_frames(case: Case, lamp: Frames, trial: Trial) -> Readings:
     if trial.readings is not None:
         trial.readings.most = lamp.most
         return trial.readings
+    trial.readings = lamp.about(*_read(case, trial))
+    return trial.readings
+
+
+def _read(case: Case, trial: Trial) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """(whitened residual, images of the base and of an explanation's strengths, what is known of the base)."""
     evidence = case.evidence
     columns = evidence.dense([*evidence.base, *(i for c in trial.members for i in c.columns)])
     known = priors(case.model, trial.fit.values, [evidence.columns[i] for i in evidence.base])
-    trial.readings = lamp.about(np.concatenate(_kept(case, trial.images)), columns, known)
-    return trial.readings
+    return np.concatenate(_kept(case, trial.images)), columns, known
 
 
 def _measured(case: Case, trial: Trial) -> np.ndarray:

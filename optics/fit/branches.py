@@ -124,14 +124,10 @@ class Walks:
             starts = [walk.means + off * signs for signs in product((1, -1), repeat=len(own))] if len(own) > 1 else []
             least = math.inf
             for n, start in enumerate(starts):
-                there = found.values.copy()
-                for v, angle in zip(own, start):
-                    there.put(v, float(np.clip(angle, *v.parameter.bounds)))
-                ended = calibrate.fit(self.model, own, there, [f])
+                ended = calibrate.fit(self.model, own, self._turned(found.values.copy(), f, start), [f])
                 if ended.total < least - LOWER * (n > 0):
                     least, lower = ended.total, lower or n > 0
-                    for v, angle in zip(own, ended.estimate):
-                        values.put(v, float(angle))
+                    self._turned(values, f, ended.estimate)
         if lower:
             yield values
 
@@ -142,8 +138,14 @@ class Walks:
             low, high = variables[i].parameter.bounds
             values.put(variables[i], float(np.clip(factor * self.found.estimate[i], low, high)))
         for f, t in at.items():
-            for i, angle in zip(self.of[f].places, self.of[f].angles(t)):
-                values.put(variables[i], float(np.clip(angle, *variables[i].parameter.bounds)))
+            self._turned(values, f, self.of[f].angles(t))
+        return values
+
+    def _turned(self, values: Values, f: int, angles: np.ndarray) -> Values:
+        """The values, in which the angles of a frame are put."""
+        for i, angle in zip(self.of[f].places, angles):
+            v = self.found.variables[i]
+            values.put(v, float(np.clip(angle, *v.parameter.bounds)))
         return values
 
     def _misfits(self, at: Places, factor: float) -> dict[int, float]:

@@ -92,8 +92,10 @@ def fit_base(
         robust=robust,
         progress=progress,
     )
+    if tempering:
+        found = cooled(model, found, robust, progress)
     if model.captures.table is None:
-        found = lowest(model, cooled(model, found, robust, progress) if tempering else found, robust, progress)
+        found = lowest(model, found, robust, progress, cooling=tempering)
     found = settled(model, found, robust, progress, tolerance)
     found.start = begun
     return found
@@ -189,8 +191,12 @@ def cooled(model: SceneModel, found: Fit, robust: bool = False, progress: Progre
     return found
 
 
-def lowest(model: SceneModel, found: Fit, robust: bool = False, progress: Progress | None = None) -> Fit:
-    """A fit of images, or the lower one from where single frames have a lower minimum."""
+def lowest(
+    model: SceneModel, found: Fit, robust: bool = False, progress: Progress | None = None, cooling: bool = True
+) -> Fit:
+    """A fit of images, or the lower one from where single frames have a lower minimum.
+
+    cooling   whether priors may count less there; not in a refit, which is held against others with the same priors"""
 
     def follow(values: Values) -> Fit:
         again = calibrate.fit(
@@ -203,7 +209,7 @@ def lowest(model: SceneModel, found: Fit, robust: bool = False, progress: Progre
             robust=robust,
             progress=progress,
         )
-        return cooled(model, again, robust, progress)
+        return cooled(model, again, robust, progress) if cooling else again
 
     return over_branches(model, found, follow)
 
