@@ -57,6 +57,8 @@ class Path:
         default_factory=dict
     )  # of layers at real values: a derivative by one layer leaves the others
     groups: list = field(default_factory=list)
+    crossings: dict = field(default_factory=dict)  # of groups of rays at the surfaces that they meet
+    ends: dict = field(default_factory=dict)  # of each source: the rays that end on it, what it last sent along them
 
     def sequences(self) -> list[tuple[tuple[int, ...], np.ndarray]]:
         """Rays by the parts that they pass: (indices of the parts, from the camera on; which rays), up to BLOCK of them
@@ -76,7 +78,7 @@ class Path:
 
     def kept(self, group: int, place: int, name: str, scene, values: Mapping, make) -> Mueller:
         """A layer's matrix for a group of rays; the last one made at real values is kept."""
-        own = tuple(values[f"{name}.{n}"] for n in (*scene.parts[name].numbers, *scene.parts[name].words))
+        own = own_values(scene, name, values)
         if any(isinstance(v, (complex, np.ndarray)) for v in own):
             return make()
         known, matrix = self.matrices.get((group, place), (None, None))
@@ -84,6 +86,19 @@ class Path:
             matrix = make()
             self.matrices[group, place] = own, matrix
         return matrix
+
+    def forget(self) -> None:
+        """Let go of what grows with the rays and can be made anew."""
+        self.matrices.clear()
+        self.crossings.clear()
+        self.ends.clear()
+
+    def crossing(self, group: int, place: int, step: Step, rays: np.ndarray, bands: np.ndarray) -> Crossing:
+        """How a group of rays crosses the surface that it meets at a place of its sequence."""
+        known = self.crossings.get((group, place))
+        if known is None or known.wavelengths is not bands:
+            known = self.crossings[group, place] = crossing_at(step, rays, bands)
+        return known
 
 
 def layered(scene) -> bool:
@@ -232,6 +247,12 @@ def part_values(scene, name: str, values: Mapping, fields: Mapping) -> SimpleNam
     )
 
 
+def own_values(scene, name: str, values: Mapping) -> tuple:
+    """The values of a part's own parameters, words included."""
+    part = scene.parts[name]
+    return tuple([values[f"{name}.{n}"] for n in (*part.numbers, *part.words)])
+
+
 def crossing_at(step: Step, rays, bands: np.ndarray) -> Crossing:
     """How some of the rays pass the surface of a step; arrays (n, 1) against bands (B,)."""
     k, x = (tuple(a[rays][:, i : i + 1] for i in range(3)) for a in (step.k, step.x))
@@ -302,8 +323,9 @@ def transmission(scene, path: Path, values: Mapping, bands: np.ndarray, componen
     are lost transmit nothing. `until` a part: from that part, without it, to the camera; nothing where a ray does not
     meet it."""
     one = len(path.lost) == 1
-    count = max([len(path.lost), *(np.size(v) for v in values.values() if isinstance(v, np.ndarray))])
-    kind = complex if any(np.iscomplexobj(v) for v in values.values()) else float
+    arrays = [v for v in values.values() if isinstance(v, np.ndarray)]
+    stepped = any(isinstance(v, complex) for v in values.values()) or any(np.iscomplexobj(v) for v in arrays)
+    count, kind = max([len(path.lost), *(v.size for v in arrays)]), complex if stepped else float
     out = [np.zeros((count, len(bands)), kind) for _ in range(4)]
     start = detected(scene, values) if component == 0 else tuple(1.0 if j == component else 0 for j in range(4))
     for group, (parts, rays) in enumerate(path.sequences()):
@@ -320,8 +342,8 @@ def transmission(scene, path: Path, values: Mapping, bands: np.ndarray, componen
                 name,
                 scene,
                 values,
-                lambda name=name, step=step, rays=rays: layer_matrix(
-                    scene, name, crossing_at(step, rays, bands), values, path.fields
+                lambda group=group, place=place, name=name, step=step, rays=rays: layer_matrix(
+                    scene, name, path.crossing(group, place, step, rays, bands), values, path.fields
                 ),
             )
             for place, (name, step) in enumerate(names)
@@ -355,13 +377,22 @@ def emitted(scene, name: str, path: Path, values: Mapping, bands: np.ndarray) ->
     import mitsuba as mi
 
     source = scene.parts[name]
-    on = np.array(path.si.emitter(scene.mitsuba) == mi.EmitterPtr(source)) & (path.end.k[:, 2] > 0)
-    crossing = crossing_at(path.end, slice(None), bands)
+    if name not in path.ends or path.ends[name][0].wavelengths is not bands:
+        on = np.array(path.si.emitter(scene.mitsuba) == mi.EmitterPtr(source)) & (path.end.k[:, 2] > 0)
+        path.ends[name] = crossing_at(path.end, slice(None), bands), on[:, None], None, ()
+    crossing, on, known, sent = path.ends[name]
+    given = own_values(scene, name, values)
+    alike = not any(isinstance(v, np.ndarray) for v in given)
+    if alike and known == given:
+        return sent
     own = part_values(scene, name, values, {})
     if scene.integral is not None and scene.integral.auto:  # its spectrum is in the matrix from bands to channels
         own.curve, own.wavelength = None, 0.0
     vector = scene.declaration(name).stokes(crossing, own)
-    return tuple(0 if isinstance(c, int) else c * on[:, None] for c in vector)
+    sent = tuple(0 if isinstance(c, int) else c * on for c in vector)
+    if alike:
+        path.ends[name] = crossing, on, given, sent
+    return sent
 
 
 def check(scene) -> None:

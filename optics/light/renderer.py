@@ -643,7 +643,7 @@ class Renderer:
             ):  # matrices are large: those of the last geometries, at centres and at finer samples, are kept
                 self._recent.append(path)
                 if len(self._recent) > 2 * min(self.remember, 2):
-                    self._recent.pop(0).matrices.clear()
+                    self._recent.pop(0).forget()
             self._transmissions[key] = paths.transmission(self.scene, path, values, self.wavelengths, component)
             while len(self._transmissions) > 2 * self.remember:
                 self._transmissions.popitem(last=False)
