@@ -15,7 +15,7 @@ import numpy as np
 from optics.diagnosis import statistics as st
 from optics.diagnosis.evidence import Candidate
 from optics.diagnosis.explanations import Outcome, Trial, beside_refuted, wander_of
-from optics.diagnosis.refit import Case, chi2
+from optics.diagnosis.refit import Case, chi2, noisier
 from optics.diagnosis.result import Level, Shift
 from optics.diagnosis.thresholds import TOLD
 from optics.fit.branches import over_branches
@@ -97,7 +97,7 @@ def levels(case: Case, members: Sequence[Candidate], with_them: Fit, wander: flo
         found[0] = _level(case, "base", before, sum(base), count)
     else:
         with_effect = [
-            _square(case.model, f, prediction, use, sd, wander)
+            _square(case.model, f, prediction, use, sd, wander) - noisier(case, f, values, base_values, use, sd)
             for f, prediction, use, sd in zip(held_out, predictions, masks, sds)
         ]
     # a dial that must stand far off what is written down predicts a frame no better than one that misses it

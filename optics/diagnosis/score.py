@@ -237,24 +237,28 @@ def solve(
     Returns V of all columns of candidates (k, k), zero where nothing is visible, and (columns, cone) of every form.
     """
     projected, first = evidence.projected, len(evidence.base)
-    # What the noise of a derivative image makes of the products of two such images: where no more than that survives,
-    # these are random, and may be next to nothing.
-    random = evidence.normal.noise[evidence.rest] * min(OWN_NOISE / math.sqrt(evidence.apart), 1.0)
-    visible = (projected.survival > st.VISIBLE) & (np.diag(projected.information) > random)
+    visible = projected.survival > st.VISIBLE
     size = np.diag(evidence.normal.gram)
+    # what the noise of a derivative image makes of the products of two such images
+    share = min(OWN_NOISE / math.sqrt(evidence.apart), 1.0)
+    seen, spreads = np.zeros_like(projected.information), {}
     for c in candidates:
-        for columns in c.forms.values():
+        for form, columns in c.forms.items():
             own = np.array(columns) - first
             # an image of rounding alone survives any projection
             visible[own] &= (size[columns] * c.plausible**2 > gauges.STILL) & (not c.broken)
-    information = projected.information * np.outer(visible, visible)
-    score = projected.score * visible
+            own = own[visible[own]]
+            block = np.ix_(own, own)
+            seen[block], spreads[c.effect.name, form] = st.certain(
+                projected.information[block], projected.noise[block], share
+            )
+    information, score = seen @ projected.information @ seen.T, seen @ projected.score
     shared: list[tuple[np.ndarray, st.Cone]] = []
     for c in candidates:
         forms = []
         for form, columns in c.forms.items():
             own = np.array(columns) - first
-            cone = st.Cone(information[np.ix_(own, own)], c.sides, seed)
+            cone = st.Cone(information[np.ix_(own, own)], c.sides, seed, spread=spreads[c.effect.name, form])
             shared.append((own, cone))
             forms.append((form, own, cone, *cone.solve(score[own])))
         c.form, own, c.cone, fall, c.linear = _best_form(c, forms)

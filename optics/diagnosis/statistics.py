@@ -49,7 +49,7 @@ class Normal:
     def __init__(self, columns: int):
         self.gram = np.zeros((columns, columns))
         self.score = np.zeros(columns)
-        self.noise = np.zeros(columns)  # sum over pixels of the variance of one render
+        self.noise = np.zeros((columns, columns))  # sums over pixels of the covariance of one render
         self.square = 0.0
         self.count = 0
 
@@ -61,7 +61,7 @@ class Normal:
         else:
             product, middle = a.T @ b, (a + b) / 2
             product = (product + product.T) / 2
-            self.noise[where] += ((a - b) ** 2).sum(0) / 2
+            self.noise[np.ix_(where, where)] += (a - b).T @ (a - b) / 2
         self.gram[np.ix_(where, where)] += product
         self.score[where] += middle.T @ r
         self.square += float(r @ r)
@@ -77,7 +77,7 @@ class Normal:
         """Noise over signal per pixel of one render of each column."""
         signal = np.maximum(np.diag(self.gram), 1e-300)
         with np.errstate(over="ignore"):  # infinite, where the products of two images come out below 0
-            return np.sqrt(self.noise / signal)
+            return np.sqrt(np.diag(self.noise) / signal)
 
     def truncation(self, columns: Index) -> float:
         """Eigenvalues of these columns that their noise can make: kappa^2/sqrt(n), times 5, and never below TRUNCATION.
@@ -114,6 +114,7 @@ class Projected:
     information  V (k, k); score: u (k,)
     survival     (k,) V_jj / |g_j|^2, 0..1
     response     (p, k) d base parameters / d strength: how a calibration would move to hide the effect
+    noise        (k, k) what the noise of one render of the images adds to V, what the base takes of it taken off
     rank         of the base; absorbed: |Q'r|^2; chi2: r'r - |Q'r|^2
     """
 
@@ -121,6 +122,7 @@ class Projected:
     score: np.ndarray
     survival: np.ndarray
     response: np.ndarray
+    noise: np.ndarray
     rank: int
     absorbed: float
     chi2: float
@@ -154,14 +156,42 @@ def project(
     v = normal.gram[np.ix_(rest, rest)] - across.T @ x
     absorbed = float(b @ inv @ b)
     if noisy:
-        absorbed = max(
-            absorbed - float(np.diag(inv) @ normal.noise[base]) * normal.square / max(normal.count, 1) / 2, 0.0
-        )
+        own = float((inv * normal.noise[np.ix_(base, base)]).sum())
+        absorbed = max(absorbed - own * normal.square / max(normal.count, 1) / 2, 0.0)
     prior = float(np.sum(pull**2 / np.where(precision > 0, precision, 1.0)))
     survival = np.clip(np.divide(np.diag(v), raw, out=np.zeros(len(rest)), where=raw > 0), 0.0, 1.0)
+    both, less = np.concatenate([base, rest]), np.vstack([-x, np.eye(len(rest))])
     return Projected(
-        (v + v.T) / 2, normal.score[rest] - x.T @ b, survival, -x, rank, absorbed, normal.square + prior - absorbed
+        information=(v + v.T) / 2,
+        score=normal.score[rest] - x.T @ b,
+        survival=survival,
+        response=-x,
+        noise=less.T @ normal.noise[np.ix_(both, both)] @ less,
+        rank=rank,
+        absorbed=absorbed,
+        chi2=normal.square + prior - absorbed,
     )
+
+
+def certain(information: np.ndarray, noise: np.ndarray, share: float) -> tuple[np.ndarray, float]:
+    """Of the strengths of one effect, the combinations of which images show more than their own noise.
+
+    information, noise   (k, k) of the effect's images (`Projected`)
+    share                of the noise of one render: what may be left of it in the product of two
+
+    Returns (k, k) P, by which scores are multiplied (and V from both sides), and by how much scores vary more than V
+    says: with a mean of two renders by V + N/2, so by 1 + the largest eigenvalue of V^-1 N/2. Two strengths that act
+    almost alike leave next to nothing of their difference: products of two renders are then random, near 0 or below it,
+    and a score over one of these passes for a fall of chi2 of any size (in a printed grid 40 for 3)."""
+    size = np.sqrt(np.maximum(np.diag(information), 0.0))
+    scale = np.where(size > 0, 1 / np.where(size > 0, size, 1.0), 0.0)
+    values, vectors = np.linalg.eigh(information * scale * scale[:, None])
+    own = np.einsum("ij,ik,kj->j", vectors, noise * scale * scale[:, None], vectors)
+    keep = (values > share * own) & (values > 0)
+    vectors, values = vectors[:, keep], values[keep]
+    root = (vectors / np.sqrt(values)).T * scale
+    spread = 1 + np.linalg.eigvalsh(root @ noise @ root.T).max(initial=0.0) / 2
+    return size[:, None] * (vectors @ vectors.T) * scale, float(spread)
 
 
 # -- one effect ------------------------------------------------------------------------------------------------------
@@ -171,10 +201,14 @@ class Cone:
     T = max over allowed s of 2 s'u - s'Vs. Under the null hypothesis T follows a mixture of chi2 distributions whose
     weights (probability that j strengths come out off their bound) are exact for one strength and simulated for more.
     Combinations of strengths of which the projection has left only rounding (VISIBLE) are undetermined.
+
+    spread   variance of scores over V, above 1 where the images of the effect are noisy (`certain`)
     """
 
-    def __init__(self, information: np.ndarray, sides: Sequence[int], seed: int = 0, draws: int = 10_000):
-        side = np.asarray(sides, int)
+    def __init__(
+        self, information: np.ndarray, sides: Sequence[int], seed: int = 0, draws: int = 10_000, spread: float = 1.0
+    ):
+        side, self.spread = np.asarray(sides, int), spread
         self.information = np.asarray(information, float)
         diagonal = np.diag(self.information)
         self.live = np.flatnonzero(diagonal > 0)
@@ -239,13 +273,13 @@ class Cone:
 
     @property
     def expectation(self) -> float:
-        """Mean of T when the effect is absent: 1 for a free strength, 1/2 for a one-sided one."""
-        return float(self.weights @ np.arange(len(self.weights)))
+        """Mean of T when the effect is absent: 1 for a free strength, 1/2 for a one-sided one, times the spread."""
+        return self.spread * float(self.weights @ np.arange(len(self.weights)))
 
     @property
     def sd(self) -> np.ndarray:
         """(k,) standard deviation of each strength, NaN where it is undetermined."""
-        variance = np.diag(self.inverse)
+        variance = self.spread * np.diag(self.inverse)
         return np.sqrt(np.where(variance > 0, variance, np.nan))
 
     def p(self, fall) -> np.ndarray:
@@ -255,7 +289,7 @@ class Cone:
         fall = np.asarray(fall, float)
         p = np.where(fall > 0, 0.0, self.weights[0])
         for dof in np.flatnonzero(self.weights[1:]) + 1:
-            p = p + self.weights[dof] * chdtrc(dof, fall)
+            p = p + self.weights[dof] * chdtrc(dof, fall / self.spread)
         return np.where(fall > 0, p, 1.0)
 
     def critical(self, p: float) -> float:
@@ -270,7 +304,7 @@ class Cone:
         """Probability that T exceeds `critical` when the strengths are `strength`: noncentral with ncp = s'Vs."""
         from scipy.special import chndtr, ndtr
 
-        ncp = float(strength @ self.information @ strength)
+        ncp, critical = float(strength @ self.information @ strength) / self.spread, critical / self.spread
         dof = int(np.flatnonzero(self.weights)[-1])
         if not ncp > 0 or dof == 0:
             return 0.0

@@ -115,6 +115,10 @@ class Model(Protocol):
         """(H, W, C) in DN^2, of a frame about its prediction: camera noise and, if `monte_carlo`, the estimate's."""
         ...
 
+    def error_of_estimate(self, values: Values, index: int) -> np.ndarray:
+        """(H, W, C) in DN^2, the estimate's alone, if `monte_carlo`."""
+        ...
+
     def errors_of_settings(self, values: Values, index: int) -> dict[str, np.ndarray]:
         """key -> (N, 1, C) standard deviation in DN, signed, that the error of a setting brings to each reading of a
         sweep (`Frame.uncertainty`); it is part of `variance`. Empty where settings are exact."""

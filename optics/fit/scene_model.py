@@ -764,7 +764,7 @@ class SceneModel:
         (d prediction / d setting x sd)^2 for every setting with an uncertainty (`capture_set.sweeps`)."""
         noise = self.noise.variance(prediction)
         if self.monte_carlo:
-            noise = noise + self._error(values, index)
+            noise = noise + self.error_of_estimate(values, index)
         if self._dialled(index):
             noise = noise + self._of_settings(values, index)
         return noise
@@ -821,7 +821,7 @@ class SceneModel:
         found = {key: self._tangent(linear, now, {key: factor}, 0) for key, factor in factors.items()}
         return {key: slope for key, slope in found.items() if slope is not None}
 
-    def _error(self, values: Values, index: int) -> np.ndarray:
+    def error_of_estimate(self, values: Values, index: int) -> np.ndarray:
         """(H, W, C) variance of a Monte Carlo prediction, DN^2."""
         from scipy.ndimage import uniform_filter
 
@@ -836,7 +836,7 @@ class SceneModel:
         if not self.monte_carlo:
             return 0.0
         prediction = self.predict(Values(), [index])[0]
-        return float(np.sqrt(np.mean(self._error(Values(), index) / self.noise.variance(prediction))))
+        return float(np.sqrt(np.mean(self.error_of_estimate(Values(), index) / self.noise.variance(prediction))))
 
     def coordinates(self, values: Values, index: int, seed: int = 0) -> dict[str, np.ndarray]:
         return geometry.coordinates(self, values, index, seed)
