@@ -374,17 +374,21 @@ def save(figure, file: Path) -> None:
 
 
 # -- a reading against a parameter -----------------------------------------------------------------------------------
+BESIDE = 2  # pixels about a spot, each way
+
+
 class Spot(Renderer):
-    """One pixel of a scene's image, by its own light: the pixels about it say whether it lies at a rim."""
+    """One pixel of a scene's image, by its own light: the pixels about it, two each way, say whether it lies at a rim
+    and how its mean differs from its middle."""
 
     def __init__(self, scene: Scene, column: int, row: int, whole: bool = False):
         super().__init__(scene, remember=4)
         self.whole, full = whole, (self.width, self.height)
-        self.corner = (0, 0) if whole else (max(column - 1, 0), max(row - 1, 0))
+        self.corner = (0, 0) if whole else (max(column - BESIDE, 0), max(row - BESIDE, 0))
         self.at = (row - self.corner[1], column - self.corner[0])
         if not whole:
             self.width, self.height = (
-                min(place + 2, size) - start for place, size, start in zip((column, row), full, self.corner)
+                min(place + BESIDE + 1, size) - start for place, size, start in zip((column, row), full, self.corner)
             )
 
     def _trace(self, u: np.ndarray, v: np.ndarray, lens: np.ndarray | None = None):

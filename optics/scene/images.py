@@ -23,6 +23,26 @@ def finer_of(image: np.ndarray, side: int) -> np.ndarray:
     return image
 
 
+def bend(image: np.ndarray, rim: np.ndarray) -> np.ndarray:
+    """(H, W, B) sum of the second differences along both axes of an image (H, W, B), in which `rim` (H, W) are pixels
+    that do not go on as their neighbours do: 0 there and beside them. The image goes on beyond its borders as it bends
+    there.
+
+    A 24th of it is by how much the mean of a pixel exceeds the value at its middle, to second order."""
+    found = np.zeros_like(image)
+    for axis in (0, 1):
+        if image.shape[axis] < 3:
+            continue
+        along, out = np.moveaxis(image, axis, 0), np.moveaxis(found, axis, 0)
+        own = np.moveaxis(rim, axis, 0)
+        smooth = ~(own[:-2] | own[1:-1] | own[2:])
+        second = (along[:-2] - 2 * along[1:-1] + along[2:]) * smooth[..., None]
+        out[1:-1] += second
+        out[0] += second[0]
+        out[-1] += second[-1]
+    return found
+
+
 def in_parts(image: np.ndarray, side: int) -> np.ndarray:
     """(H, W, side, side, B): an image (side H, side W, B) by pixels."""
     height, width = (n // side for n in image.shape[:2])

@@ -350,13 +350,27 @@ FLAT = {
 }
 
 
-def test_a_flat_gel_under_one_led_is_the_closed_form_in_every_pixel(bench):
+def test_a_pixel_is_the_mean_of_what_it_sees(bench):
+    """Next to an LED a pixel's middle is 6e-4 off its mean, by 8 x 8 places in it; second differences of the middles
+    leave a tenth of that, at the image's borders a third. A rough face has a kink (S3)."""
+    values = {**bench.values, **FLAT, "led_1.mu": 1.6, "membrane.sigma": 0.0}
+    width, height = bench.scene.camera.resolution
+    middles, _ = flat_pixel(values, width, height)
+    means = flat_pixel(values, 8 * width, 8 * height)[0].reshape(height, 8, width, 8, 3).mean((1, 3))
+    found = bench.renderer.led(values, "led_1").radiance
+    off, missed = (np.abs(image / means - 1)[..., 0] for image in (middles, found))
+    assert off.max() > 4e-4
+    assert missed[1:-1, 1:-1].max() < 0.1 * off[1:-1, 1:-1].max()
+    assert missed.max() < 0.4 * off.max()
+
+
+def test_a_flat_gel_under_one_led_is_the_closed_form_in_every_pixel(bench, at_middles):
     values = {**bench.values, **FLAT}
     width, height = bench.scene.camera.resolution
     close(bench.renderer.led(values, "led_1").radiance, flat_pixel(values, width, height)[0])
 
 
-def test_absorption_follows_the_lengths_inside_the_gel(bench):
+def test_absorption_follows_the_lengths_inside_the_gel(bench, at_middles):
     """Beer-Lambert over both ways between z = -thickness and the face; the LED stands below the window's plane at z =
     -5."""
     values = {**bench.values, **FLAT, "gel.absorption": 0.13}
@@ -373,7 +387,7 @@ def test_absorption_follows_the_lengths_inside_the_gel(bench):
     close(found[..., 0], np.exp(-0.13 * (np.linalg.norm(lamp - p, axis=-1) + d_view)))
 
 
-def test_haze_is_the_single_scattering_integral(bench):
+def test_haze_is_the_single_scattering_integral(bench, at_middles):
     """The veil against 500 midpoints along the camera's ray inside the gel, and the loss of what crosses it."""
     h = 0.03
     values = {**bench.values, **FLAT, "led_1.mu": 1.2, "led_1.pan": 0.0, "led_1.tilt": 0.0}
@@ -425,7 +439,7 @@ def test_ambient_light_meets_the_facets_that_light_of_leds_meets(bench):
     assert np.abs(found - np.interp(view, at, share)).max() < 2e-3  # straight lines between twelve angles
 
 
-def test_height_fall_off_and_ambient_light(bench):
+def test_height_fall_off_and_ambient_light(bench, at_middles):
     """exp(-c h) with the height of the face; rho E/pi everywhere on a smooth one; rho G/pi (1 - n_z)/2 with n_z towards
     the camera."""
     values = {**bench.values, "gel.press_depth": 0.8}

@@ -99,7 +99,7 @@ def expected(points, *moved, **also):
 
 
 @pytest.mark.parametrize("name", STRIPS)
-def test_light_on_a_plane_is_that_of_lamberts_polygon(name, mitsuba, load):
+def test_light_on_a_plane_is_that_of_lamberts_polygon(name, mitsuba, load, at_middles):
     from optics.light.renderer import Renderer
 
     scene = load(name)
@@ -122,7 +122,7 @@ def test_light_on_a_plane_is_that_of_lamberts_polygon(name, mitsuba, load):
         ("roll", lambda d: {"roll": d}),
     ],
 )
-def test_derivatives_are_those_of_lamberts_polygon(key, moved, mitsuba, load):
+def test_derivatives_are_those_of_lamberts_polygon(key, moved, mitsuba, load, at_middles):
     """By the model, on an unshadowed plane, against differences of the closed form."""
     from pathlib import Path
 

@@ -84,6 +84,9 @@ class Exact:
     def variance(self, values: Values, index: int, prediction: np.ndarray) -> np.ndarray:
         return self.noise.variance(prediction)
 
+    def error_of_estimate(self, values: Values, index: int) -> np.ndarray:
+        return np.zeros(self.shape)
+
     def coordinates(self, values: Values, index: int, seed: int = 0) -> dict[str, np.ndarray]:
         return {}
 

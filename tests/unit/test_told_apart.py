@@ -497,11 +497,11 @@ def test_pairs_are_refitted_until_none_may_win_or_nobody_can_wait(search_of_pair
     names = "abcdef"
     effects = [candidate(n) for n in names]
     trials = [trial([], 0.0, 70.0), *(trial([c], 5000.0, 35.0) for c in effects)]
-    ranked = [(9900.0 - 20 * i, effects[0], c, np.zeros(2)) for i, c in enumerate(effects[1:])]
+    ranked = [(9900.0 - 100 * i, effects[0], c, np.zeros(2)) for i, c in enumerate(effects[1:])]
     ranked.append((7000.0, effects[1], effects[2], np.zeros(2)))
     monkeypatch.setattr(explanations.pairs, "REFITTED", 3)
-    # within CLEAR of what was reached, the second might still be better
-    tried, untried = search_of_pairs(trials, ranked, lambda names: 9881.0 + 1.5 * explanations.CLEAR)
+    # within CLEAR of what was reached, the second might still be better, and by what was expected of the first wrongly
+    tried, untried = search_of_pairs(trials, ranked, lambda names: 9890.0)
     assert tried == [{"a", "b"}] and not untried
     tried, untried = search_of_pairs(trials, ranked, lambda names: 6000.0)
     assert tried == [{"a", "b"}, {"a", "c"}, {"a", "d"}]
@@ -520,10 +520,14 @@ def test_what_seems_to_leave_nothing_is_tried_beside_what_may_lower_it(search_of
 
 
 def test_what_was_promised_is_held_against_what_was_promised(search_of_pairs):
-    """Images promised 200 too little of a pair; of another that they promise 5 less, they may as well."""
+    """Images promised 200 too little of a pair; of others that they promise 5 and 150 less, they may as well; of one
+    with 300 less they would have to be more wrong."""
     a, b, c = (candidate(n) for n in "abc")
     trials = [trial([], 0.0, 70.0), *(trial([e], 6000.0, 30.0) for e in (a, b, c))]
-    ranked = [(9000.0, a, b, np.zeros(2)), (8995.0, a, c, np.zeros(2)), (8900.0, b, c, np.zeros(2))]
+    ranked = [(9000.0, a, b, np.zeros(2)), (8995.0, a, c, np.zeros(2)), (8850.0, b, c, np.zeros(2))]
+    tried, untried = search_of_pairs(trials, ranked, lambda names: 9200.0 if "b" in names else 9210.0)
+    assert tried == [{"a", "b"}, {"a", "c"}, {"b", "c"}] and not untried
+    ranked[2] = (8700.0, *ranked[2][1:])
     tried, untried = search_of_pairs(trials, ranked, lambda names: 9200.0 if "b" in names else 9210.0)
     assert tried == [{"a", "b"}, {"a", "c"}] and not untried
 
