@@ -21,6 +21,7 @@ from optics.scene.declare import Effect
 from optics.scene.parameter import Values, Variable
 
 NOT_FINITE = 0.01  # of the usable values: more than stray pixels, such as a normal that no surface has
+DARK = 1e-6  # of the noise: less light than this, on average, is none
 OF_SCALE = 0.003  # of full scale: the offset of an amplifier or a meter that was not set to zero
 SQUARE_ONSET = 1e-3  # plausible sizes from neutral below which a squared parameter counts as being there
 
@@ -404,7 +405,7 @@ def measure(
     _require_values(evidence)
     count = evidence.normal.count
     evidence.signal = signal / count - float(model.noise.black_level)
-    if not evidence.signal:
+    if abs(evidence.signal) <= DARK * math.sqrt(variance / count):
         raise Underdetermined(
             f"diagnose: the calibrated model predicts no light in any of {len(frames)} frames: they are no brighter "
             f"than black_level = {float(model.noise.black_level):g}; expose longer, or correct [noise] black_level in "

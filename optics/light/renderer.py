@@ -49,7 +49,7 @@ PAINTED = 0.05  # of the largest reflectance of a texture: a step from pixel to 
 # level in 200
 BENT = 1e-3
 BENT_SIDE = 4  # finer samples each way where the face bends: the mean of what varies smoothly needs few
-SOFT = 16  # points of a light, above which rims of its shadows take the samples of what bends, BENT_SIDE each way
+SOFT = 25  # points of a light, above which rims of its shadows take the samples of what bends, BENT_SIDE each way
 CREASE = 25.0  # deg from pixel to pixel: what is no smooth surface
 R2 = 0.7548776662466927, 0.5698402909980532  # of the R2 sequence: shifts from pixel to pixel
 MOVES = ("light x", "light y", "light z", "light turn")  # roles of a light's parameters that move it

@@ -2,14 +2,14 @@
 
 Definition
     L' = mean of L over a disc of area A across the LED's axis, with the shadows of each of its points
-The mean is taken over 36 points that have the mean square radius of the disc. The strength is the area, since the
+The mean is taken over 25 points that have the mean square radius of the disc. The strength is the area, since the
 smooth part of the effect grows with the radius squared.
 Fingerprint
     shadow rims widen with the distance between the edge and the face it shades; far from rims almost nothing changes.
     Lens blur softens all contours alike.
 Validity
-    the penumbra of a finite source is not analytic at A = 0, so the ranking takes a finite step; the 36 points show as
-    steps in a penumbra wider than about 6 px.
+    the penumbra of a finite source is not analytic at A = 0, so the ranking takes a finite step; the 25 points show as
+    steps in a penumbra wider than about 5 px.
 References
     F-TAC Hand supplementary information, S1.3 (LEDs taken as points there).
 """

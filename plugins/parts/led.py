@@ -149,7 +149,7 @@ PARAMETERS = (
 )
 
 
-SIDE = 6  # points of the emitting area each way
+SIDE = 5  # points of the emitting area each way; not above SOFT in all, so that a small one has sharp rims
 
 
 def _spread() -> list[float]:
