@@ -24,6 +24,7 @@ from optics.scene.mitsuba_parts import is_part
 
 STEPS = 24  # surfaces that a ray may pass
 BLOCK = 8192  # rays at a time in numpy: what they take stays near the processor
+CROSSINGS = 100_000  # rays whose crossings are kept, 90 bytes at each surface: of more, arithmetic takes the time
 GRAZE = 1e-4  # mm per mm of the coordinates: how far beyond a surface a ray goes on
 
 
@@ -94,7 +95,9 @@ class Path:
         self.ends.clear()
 
     def crossing(self, group: int, place: int, step: Step, rays: np.ndarray, bands: np.ndarray) -> Crossing:
-        """How a group of rays crosses the surface that it meets at a place of its sequence."""
+        """How a group of rays crosses the surface that it meets at a place of its sequence; of few rays it is kept."""
+        if len(self.lost) > CROSSINGS:
+            return crossing_at(step, rays, bands)
         known = self.crossings.get((group, place))
         if known is None or known.wavelengths is not bands:
             known = self.crossings[group, place] = crossing_at(step, rays, bands)
