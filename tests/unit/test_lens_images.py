@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.special import erf
 
-from optics.scene.images import blurred, magnified
+from optics.scene.images import bend, blurred, magnified
 
 WIDTH, HEIGHT, SD = 40, 30, 1.1  # px; of a spot's Gaussian
 
@@ -50,3 +50,29 @@ def test_blur_makes_of_a_spot_a_wider_one(variance):
     inner = (slice(6, -6), slice(6, -6))
     expected, found = (image[inner] - spots()[inner] for image in (spots(0.0, variance), blurred(spots(), variance)))
     assert float((found * expected).sum() / (expected**2).sum()) == pytest.approx(1, abs=0.03)
+
+
+def test_what_bends_smoothly_has_its_mean_by_second_differences():
+    """Of polynomials of the third degree exactly, at the borders of the second; nothing where a pixel or its neighbour
+    is at a rim."""
+    rng = np.random.default_rng(5)
+    v, u = np.mgrid[:9, :12].astype(float)
+    places = (np.arange(64) + 0.5) / 64 - 0.5
+    fine_v, fine_u = (
+        x[..., None, None] + shift for x, shift in zip((v, u), np.meshgrid(places, places, indexing="ij"))
+    )
+    for degree, inner in ((2, slice(None)), (3, slice(1, -1))):
+        terms = [(a, b) for a in range(degree + 1) for b in range(degree + 1 - a)]
+        weights = rng.standard_normal(len(terms))
+
+        def surface(x, y):
+            return sum(w * x**a * y**b for w, (a, b) in zip(weights, terms))
+
+        middles, means = surface(v, u), surface(fine_v, fine_u).mean((-1, -2))
+        found = middles + bend(middles[..., None], np.zeros((9, 12), bool))[..., 0] / 24
+        # 64 x 64 midpoints leave 1/4096 of the difference
+        assert np.abs(found - means)[inner, inner].max() < 1e-3 * np.abs(means - middles)[inner, inner].max()
+    rim = np.zeros((9, 12), bool)
+    rim[4, 5] = True
+    off = bend((v**2)[..., None], rim)[..., 0]
+    assert (off[3:6, 5] == 0).all() and off[4, 4] == 2 and off[4, 6] == 2 and off[2, 5] == 2
