@@ -26,6 +26,9 @@ from optics.scene.loader import Scene
 
 VARIANT = "llvm_ad_mono"
 FINE = 8  # parts of a pixel each way, on which blur acts: what a pixel has is the mean of what falls on it
+# Times the samples in the penumbra of a disc, and of light that is reflected twice: with 64 of them their own noise is
+# a tenth to a third of the photons', and most of it lies in the few pixels that show how large a disc is
+PENUMBRA, REFLECTED = 8, 4
 AROUND = 6  # pixels beyond the borders that blur brings light from
 CAMERA = Noise(system_gain=0.04, dark_noise=0.8, black_level=8.0, saturation=255.0, prnu=0.0)
 MAKERS = (
@@ -64,7 +67,7 @@ class Maker:
 
     effects   {name of a known effect: strength}, in the units of the effect's own parameters
     noise     of one frame
-    spp       samples per pixel; their noise is far below the photons'
+    spp       samples per pixel, of a point that lights a face directly; their noise is far below the photons'
     frames    exposed one after the other and summed to one image; the captures state the noise of the sum
     """
 
@@ -233,8 +236,9 @@ class Maker:
             }
         return mi.load_dict(content, optimize=False)
 
-    def traced(self, scene, rho: float, led: str | None = None, depth: int = 2) -> np.ndarray:
-        """(H, W) radiance by Mitsuba's path tracer; the scene's light is moved to where the LED is."""
+    def traced(self, scene, rho: float, led: str | None = None, depth: int = 2, times: int = 1) -> np.ndarray:
+        """(H, W) radiance by Mitsuba's path tracer, by so many times the samples; the scene's light is moved to where
+        the LED is."""
         import mitsuba as mi
 
         params = mi.traverse(scene)
@@ -247,7 +251,7 @@ class Maker:
         self.count += 1
         integrator = mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": 1000})
         seed = (self.seed * 100003 + self.count) % 2**32
-        return np.array(mi.render(scene, integrator=integrator, spp=self.spp, seed=seed))[..., 0]
+        return np.array(mi.render(scene, integrator=integrator, spp=times * self.spp, seed=seed))[..., 0]
 
     def light(self, press: Sequence[float]) -> dict[str, np.ndarray]:
         """{LED: (H, W, 3) radiance at power 1}, and under 'ambient' what no LED made."""
@@ -260,9 +264,11 @@ class Maker:
             scene = self.scene(mesh, self.emitter(self.leds[0]), 2)
             for led in self.leds:
                 if "LED size" in self.effects:
-                    images[led] = self.traced(self.scene(mesh, self.disc(led), 2), 1.0)[..., None] * np.array(rho)
+                    disc = self.scene(mesh, self.disc(led), 2)
+                    images[led] = self.traced(disc, 1.0, times=PENUMBRA)[..., None] * np.array(rho)
                 elif bounce or "specular lobe" in self.effects:
-                    stack = [self.traced(scene, r, led, 3 if bounce else 2) for r in rho]
+                    depth, times = (3, REFLECTED) if bounce else (2, 1)
+                    stack = [self.traced(scene, r, led, depth, times) for r in rho]
                     if bounce and bounce != 1:
                         direct = self.traced(scene, 1.0, led)
                         stack = [r * direct + bounce * (s - r * direct) for r, s in zip(rho, stack)]

@@ -185,11 +185,11 @@ class Wild(Workshop, synthetic.Maker):
             light["ambient"] = light["ambient"] * (1 + 0.5 * x / x.max())[..., None]
         return light
 
-    def traced(self, scene, rho, led=None, depth=2):
+    def traced(self, scene, rho, led=None, depth=2, times=1):
         if self.other and "interreflection" in self.effects and depth == 3:
             depth = 6
         if not (self.other and "LED size" in self.effects) or led is not None:
-            return super().traced(scene, rho, led, depth)
+            return super().traced(scene, rho, led, depth, times)
         return self._bar(scene, rho, depth)
 
     def _bar(self, scene, rho, depth):
