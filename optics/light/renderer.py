@@ -73,7 +73,10 @@ BOUNCE_NUMBERS = 10  # of a direction: a place in the cell, a technique, two dir
 # image by a finite layer, 6 % by the distortion, 1 % or less by the camera, the size of beads and how far they sank
 ROUGHLY = 4
 ROUGH_SAMPLES = 64  # of a pixel, below which no fewer are taken
-BOUNCE_CELL = 2  # px each way of a cell; 1 in a crowded scene, whose pixels differ
+BOUNCE_CELL = 2  # px each way of a cell; 1 in a crowded scene, whose pixels differ, and of small images
+# directions of a pixel: where BOUNCE_RAYS give as many, each pixel is a cell. What a dent 8 px across reflects into
+# itself is smeared by cells of 2 px, and was found a quarter too strong
+FEW_BOUNCES = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,8 +132,9 @@ class Renderer:
             scene.parameters[key] = replace(scene.parameters[key], plausible=CROWDED_PUPIL)
         self.rough = False  # whether a crowded scene is sampled ROUGHLY: for derivatives
         self.rim_samples = LAYERED_RIM_SAMPLES if self.layered else RIM_SAMPLES
-        cells = -(-self.height // BOUNCE_CELL) * -(-self.width // BOUNCE_CELL)
-        self.bent_side, self.bounce = BENT_SIDE, (BOUNCE_CELL, _power_of_two(max(BOUNCE_SAMPLES, BOUNCE_RAYS / cells)))
+        cell = 1 if FEW_BOUNCES * self.height * self.width <= BOUNCE_RAYS else BOUNCE_CELL
+        cells = -(-self.height // cell) * -(-self.width // cell)
+        self.bent_side, self.bounce = BENT_SIDE, (cell, _power_of_two(max(BOUNCE_SAMPLES, BOUNCE_RAYS / cells)))
         self.grazing = not self.crowded  # whether second directions are drawn where a level skin meets itself
         if self.crowded:
             self.rim_samples, self.bent_side = CROWDED_SAMPLES << (self.fine - 1), 2
@@ -1027,10 +1031,10 @@ class Renderer:
         """(H, W, B): light of one LED at power 1 after two reflections, unpolarized before any layers, as a component
         of the Stokes vector; the mean over second directions.
 
-        Light from all around varies slowly: it is gathered for every second pixel each way, over the area of the four,
-        and interpolated linearly in between. A cell's directions are those of one Sobol sequence, shifted from cell to
-        cell by another, so that what a mean misses is noise of single cells. They are the same for every geometry and
-        LED of a seed, for differences.
+        Light from all around varies slowly: of large images it is gathered for every second pixel each way, over the
+        area of the four, and interpolated linearly in between. A cell's directions are those of one Sobol sequence,
+        shifted from cell to cell by another, so that what a mean misses is noise of single cells. They are the same for
+        every geometry and LED of a seed, for differences.
 
         roughly   with ROUGHLY times fewer directions
         """
