@@ -1,13 +1,13 @@
 """Prediction: what a scene says that a capture set should look like, frame by frame, and how that changes.
 
 Light is linear in every LED, so each LED is rendered once per geometry at power 1 and kept; powers, exposure, colour
-and response act on the kept images. One sample per pixel does away from edges, at its middle; a 24th of the second
-differences from pixel to pixel leads from there to the mean of the pixel (`optics.scene.images.bend`; next to an LED
-of `gelsight` with pixels of 0.5 mm the two differ by 0.5 %, on `digit` by 0.1 %). Pixels at the rim of a shadow or of
-the gel are sampled 128 times; where the face bends, and in the penumbra of a light of many points, 16 times.
-Derivative images come from Dr.Jit in forward mode through the shading, with the primary hits and shadows kept; at
-rims, where that misses the moving edge, and for everything that moves geometry they are central differences with
-common samples (`Parameter.how`)."""
+and response act on the kept images. One sample per pixel does away from edges, at its middle; in scenes without layers
+a 24th of the second differences from pixel to pixel leads from there to the mean of the pixel
+(`optics.scene.images.bend`; next to an LED of `gelsight` with pixels of 0.5 mm the two differ by 0.5 %, on `digit` by
+0.1 %). Pixels at the rim of a shadow or of the gel are sampled 128 times; where the face bends, and in the penumbra of
+a light of many points, 16 times. Derivative images come from Dr.Jit in forward mode through the shading, with the
+primary hits and shadows kept; at rims, where that misses the moving edge, and for everything that moves geometry they
+are central differences with common samples (`Parameter.how`)."""
 
 from __future__ import annotations
 
@@ -805,7 +805,7 @@ class Renderer:
         result = raw[0] * weights[0] if self.layered else raw[0].copy()
         centres = result.copy() if side > 1 else result
         height = self.height if len(result) == self.height * self.width else -1
-        if height > 0 and image.rim is not None:
+        if height > 0 and image.rim is not None and not self.layered:
             image_of = result.reshape(height, self.width, -1)
             image_of += bend(image_of, image.rim) / 24
         fine = raw[1] * weights[1] if len(image.index) else None

@@ -25,8 +25,8 @@ def finer_of(image: np.ndarray, side: int) -> np.ndarray:
 
 def bend(image: np.ndarray, rim: np.ndarray) -> np.ndarray:
     """(H, W, B) sum of the second differences along both axes of an image (H, W, B), in which `rim` (H, W) are pixels
-    that do not go on as their neighbours do: 0 there and beside them. The image goes on beyond its borders as it bends
-    there.
+    that do not go on as their neighbours do. Beside these, and at the borders, the image bends as it does one pixel
+    further in: so nothing jumps where a rim moves on by a pixel.
 
     A 24th of it is by how much the mean of a pixel exceeds the value at its middle, to second order."""
     found = np.zeros_like(image)
@@ -35,11 +35,15 @@ def bend(image: np.ndarray, rim: np.ndarray) -> np.ndarray:
             continue
         along, out = np.moveaxis(image, axis, 0), np.moveaxis(found, axis, 0)
         own = np.moveaxis(rim, axis, 0)
-        smooth = ~(own[:-2] | own[1:-1] | own[2:])
-        second = (along[:-2] - 2 * along[1:-1] + along[2:]) * smooth[..., None]
-        out[1:-1] += second
-        out[0] += second[0]
-        out[-1] += second[-1]
+        known = np.zeros(own.shape, bool)
+        known[1:-1] = ~(own[:-2] | own[1:-1] | own[2:])
+        second = np.zeros_like(along)
+        second[1:-1] = (along[:-2] - 2 * along[1:-1] + along[2:]) * known[1:-1, :, None]
+        count, beside = np.zeros(own.shape), np.zeros_like(along)
+        for here, there in ((slice(1, None), slice(None, -1)), (slice(None, -1), slice(1, None))):
+            beside[here] += second[there]
+            count[here] += known[there]
+        out += np.where(known[..., None], second, beside / np.maximum(count, 1)[..., None])
     return found
 
 

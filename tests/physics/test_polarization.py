@@ -831,7 +831,7 @@ def test_stock_polarizers_and_retarders_on_the_axis(variant, tmp_path):
 
 # -- crossed films in a wide field -----------------------------------------------------------------------------------
 @JUST_MONO
-def test_crossed_films_in_a_wide_field(variant, tmp_path, at_middles):
+def test_crossed_films_in_a_wide_field(variant, tmp_path):
     """Korger et al. (2013): T = |t1.t2|^2/2 with t = k x a/|k x a|, in every azimuth up to 62 deg from the axis; dark
     along both films' axes, bright between them. Mitsuba's `polarizer` is of the same kind."""
     import mitsuba as mi
@@ -1128,7 +1128,7 @@ def lit_by(finger, lights):
     return {**finger.values, **{f"{n}.power": 0.0 for n in finger.scene.lights if n not in lights}}
 
 
-def test_the_room_behind_the_finger_fades_by_malus(finger, at_middles):
+def test_the_room_behind_the_finger_fades_by_malus(finger):
     """Near the axis cos^2 + T_crossed/T_parallel sin^2; everywhere what oblique films and refracting faces make of
     it."""
     wall, values = finger.on["wall"], finger.values

@@ -254,7 +254,7 @@ def test_a_spot_is_a_pixel_of_the_image(finger):
         np.testing.assert_allclose(own, picture[row, column], rtol=0.3 if rim[row, column] else 1e-5, atol=1e-9)
 
 
-def test_malus_and_the_ratio_of_extinction(bench, at_middles):
+def test_malus_and_the_ratio_of_extinction(bench):
     found = polarimetry.sweep(
         bench, "analyzer.angle", np.linspace(0, 180, 37), (2.5, 2.5), {"analyzer.leak": 0.004, "polarizer.angle": 30}
     )
