@@ -695,10 +695,11 @@ class _Ranking:
 
     def wanted(self, trials: Iterable[Trial]) -> list[Pair]:
         """The pairs that are expected to do better than the best trial, best first: than its refit, or than was
-        expected of it where that was less. What images promised too little of one pair they may of others; by what
-        they were wrong about the best, they may be wrong about its rivals: a turned film with vignetting brought 169
-        more than the 90,255 expected, and 98 less were expected of a turned plate with vignetting, which brought more.
-        """
+        expected of it where that was less. What images promised too little of one pair they may of others.
+
+        A forecast that was wrong about the best pair may be as wrong about its rivals. A turned film with vignetting
+        brought 169 more than the 90,255 expected of it; 98 less was expected of a turned plate with vignetting, which
+        brought more than the film."""
         top, best = max(((self.score_of(t), t) for t in trials), key=lambda s: s[0])
         promised = next((e for e, pair in self.expected if _names(pair) == best.names), top)
         wrong = min(abs(top - promised), pairs.LEAD * best.fall)

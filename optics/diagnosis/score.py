@@ -238,6 +238,7 @@ def solve(
     """
     projected, first = evidence.projected, len(evidence.base)
     visible = projected.survival > st.VISIBLE
+    noise = st.noise_left(evidence.normal, evidence.base, evidence.rest, projected.response)
     size = np.diag(evidence.normal.gram)
     # what the noise of a derivative image makes of the products of two such images
     share = min(OWN_NOISE / math.sqrt(evidence.apart), 1.0)
@@ -249,9 +250,7 @@ def solve(
             visible[own] &= (size[columns] * c.plausible**2 > gauges.STILL) & (not c.broken)
             own = own[visible[own]]
             block = np.ix_(own, own)
-            seen[block], spreads[c.effect.name, form] = st.certain(
-                projected.information[block], projected.noise[block], share
-            )
+            seen[block], spreads[c.effect.name, form] = st.certain(projected.information[block], noise[block], share)
     information, score = seen @ projected.information @ seen.T, seen @ projected.score
     shared: list[tuple[np.ndarray, st.Cone]] = []
     for c in candidates:

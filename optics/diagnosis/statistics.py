@@ -114,7 +114,6 @@ class Projected:
     information  V (k, k); score: u (k,)
     survival     (k,) V_jj / |g_j|^2, 0..1
     response     (p, k) d base parameters / d strength: how a calibration would move to hide the effect
-    noise        (k, k) what the noise of one render of the images adds to V, what the base takes of it taken off
     rank         of the base; absorbed: |Q'r|^2; chi2: r'r - |Q'r|^2
     """
 
@@ -122,7 +121,6 @@ class Projected:
     score: np.ndarray
     survival: np.ndarray
     response: np.ndarray
-    noise: np.ndarray
     rank: int
     absorbed: float
     chi2: float
@@ -160,23 +158,22 @@ def project(
         absorbed = max(absorbed - own * normal.square / max(normal.count, 1) / 2, 0.0)
     prior = float(np.sum(pull**2 / np.where(precision > 0, precision, 1.0)))
     survival = np.clip(np.divide(np.diag(v), raw, out=np.zeros(len(rest)), where=raw > 0), 0.0, 1.0)
-    both, less = np.concatenate([base, rest]), np.vstack([-x, np.eye(len(rest))])
     return Projected(
-        information=(v + v.T) / 2,
-        score=normal.score[rest] - x.T @ b,
-        survival=survival,
-        response=-x,
-        noise=less.T @ normal.noise[np.ix_(both, both)] @ less,
-        rank=rank,
-        absorbed=absorbed,
-        chi2=normal.square + prior - absorbed,
+        (v + v.T) / 2, normal.score[rest] - x.T @ b, survival, -x, rank, absorbed, normal.square + prior - absorbed
     )
+
+
+def noise_left(normal: Normal, base: Index, rest: Index, response: np.ndarray) -> np.ndarray:
+    """(k, k) N, the noise of one render of the columns `rest`, with what the base takes of it (`Projected.response`)
+    taken off: A'A of one render would exceed V by it."""
+    both, left = np.concatenate([base, rest]), np.vstack([response, np.eye(len(rest))])
+    return left.T @ normal.noise[np.ix_(both, both)] @ left
 
 
 def certain(information: np.ndarray, noise: np.ndarray, share: float) -> tuple[np.ndarray, float]:
     """Of the strengths of one effect, the combinations of which images show more than their own noise.
 
-    information, noise   (k, k) of the effect's images (`Projected`)
+    information, noise   (k, k) V and N of the effect's images (`Projected`, `noise_left`)
     share                of the noise of one render: what may be left of it in the product of two
 
     Returns (k, k) P, by which scores are multiplied (and V from both sides), and by how much scores vary more than V

@@ -806,8 +806,8 @@ class Renderer:
         centres = result.copy() if side > 1 else result
         height = self.height if len(result) == self.height * self.width else -1
         if height > 0 and image.rim is not None and not self.layered:
-            image_of = result.reshape(height, self.width, -1)
-            image_of += bend(image_of, image.rim) / 24
+            pixels = result.reshape(height, self.width, -1)
+            pixels += bend(pixels, image.rim) / 24
         fine = raw[1] * weights[1] if len(image.index) else None
         if fine is not None:
             result[image.index] += image.share * (image.finer.mean(fine) - result[image.index])

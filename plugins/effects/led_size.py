@@ -8,8 +8,8 @@ Fingerprint
     shadow rims widen with the distance between the edge and the face it shades; far from rims almost nothing changes.
     Lens blur softens all contours alike.
 Validity
-    the penumbra of a finite source is not analytic at A = 0, so the ranking takes a finite step; the 25 points show as
-    steps in a penumbra wider than about 5 px.
+    the penumbra of a finite source is not analytic at A = 0, so the ranking takes a finite step; the points, five
+    across the disc, show as steps in a penumbra of more pixels than that.
 References
     F-TAC Hand supplementary information, S1.3 (LEDs taken as points there).
 """

@@ -278,7 +278,7 @@ def test_strengths_that_act_almost_alike_show_nothing_of_their_difference(alike,
         normal = st.Normal(3)
         normal.add(range(3), one, rng.standard_normal(n), two)
         left = st.project(normal, [0], [1, 2])
-        seen, spread = st.certain(left.information, left.noise, 5 / np.sqrt(n))
+        seen, spread = st.certain(left.information, st.noise_left(normal, [0], [1, 2], left.response), 5 / np.sqrt(n))
         information = seen @ left.information @ seen.T
         cone = st.Cone(information, [0, 0], spread=spread)
         assert cone.rank == kept
@@ -298,7 +298,7 @@ def test_noise_that_a_base_shares_with_an_effect_is_none_of_what_is_left_of_it()
     normal.add([0, 1], renders[0], shared, renders[1])
     left = st.project(normal, [0], [1])
     assert np.diag(normal.noise) == pytest.approx([0.01 * n, 0.04 * n], rel=0.15)
-    assert left.noise[0, 0] < 1e-4 * n
+    assert st.noise_left(normal, [0], [1], left.response)[0, 0] < 1e-4 * n
 
 
 # -- bins ------------------------------------------------------------------------------------------------------------

@@ -1149,9 +1149,7 @@ def test_what_a_whole_image_gains_is_no_difference_between_its_parts():
     information, lengths = a.T @ a, np.diag(a.T @ a)
 
     def gained(strengths):
-        projected = Projected(
-            information, information @ strengths, np.ones(3), np.zeros((0, 3)), 0 * information, 0, 0.0, 0.0
-        )
+        projected = Projected(information, information @ strengths, np.ones(3), np.zeros((0, 3)), 0, 0.0, 0.0)
         whole, apart = _together(projected, lengths)
         left = apart @ projected.score
         assert left.sum() == pytest.approx(0, abs=1e-9)
@@ -1159,9 +1157,7 @@ def test_what_a_whole_image_gains_is_no_difference_between_its_parts():
 
     assert gained(np.full(3, 0.3)) == pytest.approx(0, abs=1e-9)
     assert gained(np.array([0.3, 0.3, 0.6])) > 0.5
-    absorbed = Projected(
-        information * 1e-9, information[0] * 0, np.ones(3), np.zeros((0, 3)), 0 * information, 0, 0.0, 0.0
-    )
+    absorbed = Projected(information * 1e-9, information[0] * 0, np.ones(3), np.zeros((0, 3)), 0, 0.0, 0.0)
     assert _together(absorbed, lengths) == (0.0, None)
 
 
