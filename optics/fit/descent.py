@@ -355,6 +355,7 @@ class Descent:
     def scale(self) -> bool:
         """Solve for the powers alone on the images of `linearise`, and move there if one of them is off by more than
         SCALED: of readings in volts or in 12 bits nobody knows the scale, and all other images are proportional to it.
+        Not where it is a hundredth of what a step of all brings: a faint lamp may be off by any factor.
         Returns whether theta has moved."""
         if not self.powers:
             return False
@@ -363,6 +364,9 @@ class Descent:
         moved = self._solved(own, self.theta)
         old, new = self.theta[index], moved[index]
         if not np.any((new > SCALED * old) | (old > SCALED * new)):
+            return False
+        change = new - old
+        if own.b @ change - change @ own.a @ change / 2 < self.promised / 100:
             return False
         self.theta, self.values = moved, self.moved(self.values, moved)
         return True

@@ -455,14 +455,15 @@ class SceneModel:
                 prediction, gained = black + (linear.image - black) * scale, share
         images: dict[str, np.ndarray] = {}
         at_once = self._light_at_once(values, now, variables, secant, index, seed)
-        at = self._place_of(now, index, seed)
+        at = self._place_of(now, index)
         # the tangents at rest come after all others, so that the gel is brought there once
         waiting: list[tuple[Variable, dict[str, Any], tuple | None, np.ndarray | None]] = []
         for variable in variables:
             acts = self._acts(values, variable, index)
             if not acts:
                 continue
-            key = None if at is None else (secant.get(variable.name), variable.frames, *acts.items(), *at)
+            samples = seed if self._by_chance(now, acts) else 0
+            key = None if at is None else (samples, secant.get(variable.name), variable.frames, *acts.items(), *at)
             image: Any
             if key in self._derived:
                 self._derived.move_to_end(key)
@@ -503,12 +504,18 @@ class SceneModel:
         if key is not None:
             self._keep_derived(key, image)
 
-    def _place_of(self, now: Mapping, index: int, seed: int) -> tuple | None:
-        """What a derivative image of a frame depends on besides its variable; None: images of readings are not kept."""
+    def _place_of(self, now: Mapping, index: int) -> tuple | None:
+        """What a derivative image of a frame depends on besides its variable and its samples; None: images of readings
+        are not kept."""
         if self.captures.table is not None:
             return None
         crowds = self.renderer.geometry(now) if self.renderer.crowded else ()  # bodies may have been put elsewhere
-        return index, seed, self.renderer.wanted, *crowds, *sorted(now.items())
+        return index, self.renderer.wanted, *crowds, *sorted(now.items())
+
+    def _by_chance(self, now: Mapping, keys: Iterable[str]) -> bool:
+        """Whether other samples give another derivative by these keys."""
+        second = self.renderer.bounce_key
+        return self.monte_carlo or self.sampled or bool(second and (now[second] or second in keys))
 
     def _keep_derived(self, key: tuple, image: np.ndarray | None) -> None:
         """Keep a derivative image; None where nothing depends on the variable."""

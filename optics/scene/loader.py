@@ -354,8 +354,8 @@ class Scene:
         meshes = False leaves the meshes of crowds for when `mitsuba` is asked for: enough for `traced`."""
         import mitsuba as mi
 
-        now = self.values()
-        changed = {k: v for k, v in self.check(values, where).items() if now[k] != v}
+        now = self.values()  # as checked before
+        changed = self.check({k: v for k, v in values.items() if k not in now or now[k] != v}, where)
         moved, stock = set(), False
         for key, value in changed.items():
             if key in self._stock:

@@ -27,7 +27,7 @@ from optics.scene.declare import Effect
 from optics.scene.parameter import Values, Variable
 from optics.study.places import own_plugins
 from optics.study.setup import Setup, effect_variables
-from optics.study.stages import COOLER, cooled, fit_base, off_neutral
+from optics.study.stages import COOLER, SAME, TOGETHER, cooled, fit_base, off_neutral
 from optics.version import __version__
 
 PROMISING = 0.7  # of the best fall of chi2: an unconverged refit that falls by more is worth a calibration
@@ -166,7 +166,9 @@ class Refits:
         if found.tempering > now / COOLER or found.chi2 > MISSTATED * found.dof:
             return None
         variables = tempered(self.base.variables, found.tempering)
-        base = calibrate.fit(self.model, variables, self.base.values, self.base.frames)
+        base = calibrate.fit(
+            self.model, variables, self.base.values, self.base.frames, tolerance=TOGETHER, negligible=SAME
+        )
         again = Refits(self.model, self.setup, base, self.tested, self.folder)
         again.results[self._extra(leader)] = found
         near = PROMISING * self.fall(leader)

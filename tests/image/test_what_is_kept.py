@@ -1,11 +1,17 @@
 """What a renderer keeps: images to either side of a geometry without their rays, and what second directions meet, for
 all lights."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from optics.captures.capture_set import Captures, Frame
+from optics.captures.noise import Noise
+from optics.fit.scene_model import SceneModel
 from optics.light.renderer import Renderer
 from optics.scene import loader
+from optics.scene.parameter import Values, Variable
 
 SMALL = {"width": "32", "height": "24"}
 LIGHTS = ("led_1", "led_2")
@@ -90,3 +96,18 @@ def test_large_images_push_out_no_more_than_they_take(scene, monkeypatch):
     assert (9,) not in renderer._plain and (10,) in renderer._plain
     renderer._keep_plain(("large", 0), large)  # made again: it takes no more
     assert (10,) in renderer._plain and sum(i.nbytes for i in renderer._plain.values()) == renderer._plain_bytes
+
+
+@pytest.mark.parametrize("share", (0.0, 0.5))
+def test_of_another_seed_only_what_is_drawn_is_made_again(scene, share):
+    """Another seed is there for light reflected twice, and for what its image is a part of."""
+    shape = (int(SMALL["height"]), int(SMALL["width"]), 3)
+    frame = Frame("press", np.zeros(shape, np.float32), parameters={"gel.press_depth": 0.8})
+    model = SceneModel(scene, Captures(Path("."), str(scene.path), [frame], noise=Noise(0.1, 1.0, 0.0, 255.0, 0.0)))
+    second = model.renderer.bounce_key
+    keys = ("led_1.x", "led_1.mu", "gel.press_x", "camera.gain", second)
+    variables = [Variable(key, (key,), model.parameters[key]) for key in keys]
+    found = [next(iter(model.derivatives(Values({second: share}), variables, seed=s)))[1] for s in (0, 1)]
+    same = {k for k in keys if np.shares_memory(found[0][k], found[1][k])}
+    assert same == (set() if share else set(keys) - {second})
+    assert not any(np.array_equal(found[0][k], found[1][k]) for k in set(keys) - same)

@@ -302,6 +302,41 @@ def test_powers_are_solved_for_before_the_first_step(start):
     assert np.abs(found.estimate - [30.0, 200.0]).max() < 4 * found.sd.max()
 
 
+class Tilted(Lamps):
+    """Lamps over a dark signal that rises along the image, of which none acts as a lamp."""
+
+    def __init__(self, light, tilt):
+        super().__init__(light)
+        self.parameters["camera.tilt"] = Parameter("tilt", "DN", 0.0, plausible=1.0)
+        self.base["camera.tilt"] = 0.0
+        rising = np.linspace(-1, 1, 16).reshape(self.shape)
+        self.slope = rising - self.pattern * (rising * self.pattern).sum() / (self.pattern**2).sum()
+        for frame in self.frames:
+            frame.image = frame.image + tilt * self.slope
+        self.linearised = 0
+
+    def linear_in(self, variable):
+        return variable.parameter.linear
+
+    def predict(self, values, frames=None, seed=0):
+        tilts = [self.at(values, i)["camera.tilt"] * self.slope for i in frames]
+        return [image + tilt for image, tilt in zip(super().predict(values, frames), tilts)]
+
+    def derivatives(self, values, variables, frames=None, secant=None, seed=0):
+        self.linearised += 1
+        for image, images in super().derivatives(values, variables, frames):
+            yield image, {**images, "camera.tilt": self.slope}
+
+
+def test_a_faint_lamp_that_is_far_off_costs_no_linearisation_of_its_own():
+    """It is dark; what is known of it is any factor off, and brings nothing beside what a step of all brings."""
+    model = Tilted([50.0, 0.0], 40.0)
+    variables = [Variable(k, (k,), p) for k, p in model.parameters.items()]
+    found = fit(model, variables, Values({"led_0.power": 50.0, "led_1.power": 0.06}))
+    assert found.converged and found.estimate[2] == pytest.approx(40.0, abs=5 * found.sd[2])
+    assert model.linearised <= len(found.history)
+
+
 def test_a_factor_falls_but_is_not_switched_off():
     """A dead lamp ends within its error of 0 and is named; none of the steps there is more than tenfold."""
     model, variables = lamps([50.0, -0.5])  # darker than black by half a DN, as a wrong black level makes it
