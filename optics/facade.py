@@ -417,14 +417,26 @@ class Study:
             progress=progress,
         )
 
-    def imitate(self, folder: str | Path, values: Mapping[str, float | str] | None = None, *, seed: int = 1) -> Path:
-        """Write captures as the study's model would take them, with `values` put in; returns the folder."""
+    def imitate(
+        self,
+        folder: str | Path,
+        values: Mapping[str, float | str] | None = None,
+        *,
+        seed: int = 1,
+        into_captures: bool = False,
+    ) -> Path:
+        """Write captures as the study's model would take them, with `values` put in; returns the folder.
+
+        into_captures   write the measured images instead, changed by what `values` change: they keep their own noise
+                        and all that the model lacks
+        """
         from optics.diagnosis.rehearse import imitate
 
         model = self.model
         _, present, _ = loop.kept(self.record, model)  # with what was found in held-out frames
-        present.common.update(model.scene.check(values or {}, "values"))
-        return imitate(model, present, folder, seed)
+        changed = present.copy()
+        changed.common.update(model.scene.check(values or {}, "values"))
+        return imitate(model, changed, folder, seed, present if into_captures else None)
 
     def report(self, file: str | Path | None = None, *, overwrite: bool = False) -> Path:
         """Write the study as one HTML page; returns its path (None: report.html in the study's folder)."""

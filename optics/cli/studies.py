@@ -419,6 +419,13 @@ def imitate(
     study: StudyFolder,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="A new capture folder.")],
     sets: Settings = None,
+    into_captures: Annotated[
+        bool,
+        typer.Option(
+            "--into-captures",
+            help="Write the measured images, changed by what --set changes; they keep all that the model lacks.",
+        ),
+    ] = False,
     seed: Annotated[int, typer.Option(help="Seed of the noise.")] = 1,
     plugins: Plugins = None,
     captures: CapturesNow = None,
@@ -430,5 +437,6 @@ def imitate(
     from optics.files.output import check_new_folder
 
     check_new_folder(output)
-    folder = Study.open(study, plugins=plugins, captures=captures).imitate(output, settings(sets), seed=seed)
+    found = Study.open(study, plugins=plugins, captures=captures)
+    folder = found.imitate(output, settings(sets), seed=seed, into_captures=into_captures)
     print(f"{folder}: optics calibrate {output} -o ANOTHER_STUDY")

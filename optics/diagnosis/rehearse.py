@@ -18,6 +18,7 @@ Source: the idea is that of "make_perfect_observations" in mrcal.
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -165,11 +166,18 @@ def rehearse(
     return Rehearsal(change, len(evidence.frames), rows, [c.effect.name for c in table.order if c not in live])
 
 
-def imitate(model: SceneModel, values: Values, folder: str | Path, seed: int = 0) -> Path:
+def imitate(
+    model: SceneModel, values: Values, folder: str | Path, seed: int = 0, measured_at: Values | None = None
+) -> Path:
     """Write captures as this model predicts them at these values, with its camera's noise and its frames' settings.
 
     They show what a residual would look like, and what the loop concludes from it. They prove nothing about the model,
-    which made them. Raises BadCapture for readings in a table, and as `optics.captures.capture_set.write`."""
+    which made them. Raises BadCapture for readings in a table, and as `optics.captures.capture_set.write`.
+
+    measured_at   values that describe the measured images: these are then written with what the change from there
+                  makes of a prediction, in DN, and keep their own noise and all that the model lacks; what their
+                  import advises goes with them
+    """
     captures = model.captures
     if captures.table is not None:
         raise BadCapture(
@@ -177,12 +185,20 @@ def imitate(model: SceneModel, values: Values, folder: str | Path, seed: int = 0
             "for both"
         )
     rng = np.random.default_rng([seed, 31])
+    before = [None] * len(model.frames) if measured_at is None else model.predict(measured_at)
     frames = []
-    for frame, signal in zip(model.frames, model.predict(values)):
-        image = model.noise.expose(signal, rng).astype(np.float32)
+    for index, (frame, signal, old) in enumerate(zip(model.frames, model.predict(values), before)):
+        if old is None:
+            image = model.noise.expose(signal, rng)
+        else:  # what is masked, such as a saturated value, stays as it is
+            image = np.where(model.usable(index), frame.image + (signal - old), frame.image)
+        image = image.astype(np.float32)
         if captures.cfa is not None:
             image = np.take_along_axis(image, capture_files.cfa_channel(image.shape, captures.cfa)[..., None], axis=2)
         frames.append(replace(frame, image=image, repeats=[]))
-    whole = model.noise.quantisation == 1 and float(model.noise.saturation).is_integer()
+    whole = measured_at is None and model.noise.quantisation == 1 and float(model.noise.saturation).is_integer()
     bits = None if not whole else 8 if model.noise.saturation <= 255 else 16
-    return capture_files.write(replace(captures, frames=frames, noise=model.noise, warnings=[]), folder, bits=bits)
+    written = capture_files.write(replace(captures, frames=frames, noise=model.noise, warnings=[]), folder, bits=bits)
+    if measured_at is not None and (advice := captures.folder / "import.json").is_file():
+        shutil.copyfile(advice, written / advice.name)
+    return written

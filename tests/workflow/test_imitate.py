@@ -60,6 +60,29 @@ def test_imitated_captures_are_the_models_own_with_the_cameras_noise(study, tmp_
     assert again.exit_code != 0 and "exists" in str(again.exception)
 
 
+def test_an_effect_is_put_into_the_measured_images(study, tmp_path):
+    """They change by what the model's images change, and by nothing else: their noise and their masks stay."""
+    record, model, _ = loop.take_up(study)
+    advice = model.captures.folder / "import.json"
+    advice.write_text('{"setup": {"region": "all"}}', encoding="utf-8")
+    said = CliRunner().invoke(
+        app, ["imitate", str(study), "-o", str(tmp_path / "out"), "--set", "camera.glare=0.05", "--into-captures"]
+    )
+    advice.unlink()
+    assert said.exit_code == 0, said.output
+    assert "all" in (tmp_path / "out" / "import.json").read_text(encoding="utf-8")
+    values = loop.kept(record, model)[1]
+    glaring = values.copy()
+    glaring.common["camera.glare"] = 0.05
+    changes = [b - a for a, b in zip(model.predict(values), model.predict(glaring))]
+    injected = capture_files.load(tmp_path / "out")
+    for index, (frame, change) in enumerate(zip(injected.frames, changes)):
+        measured, use = model.frames[index].image, model.usable(index)
+        # float32 of some 4000 DN, twice
+        assert np.abs(np.where(use, frame.image - measured - change, 0)).max() < 1e-3 < np.abs(change).max() / 1000
+        assert np.array_equal(np.where(use, 0, frame.image), np.where(use, 0, measured))
+
+
 @pytest.mark.slow
 def test_a_rehearsal_from_the_command_line(study):
     said = CliRunner().invoke(app, ["rehearse", str(study), "--change", "1", "--json"])
