@@ -428,7 +428,7 @@ class Study:
         """Write captures as the study's model would take them, with `values` put in; returns the folder.
 
         into_captures   write the measured images instead, changed by what `values` change: they keep their own noise
-                        and all that the model lacks
+                        and all that the model lacks. BadCapture where nothing changes
         """
         from optics.diagnosis.rehearse import imitate
 

@@ -168,6 +168,13 @@ class Noise:
             saturation=frames * self.saturation,
         )
 
+    def unrounded(self) -> Noise:
+        """Noise of values that were whole and are no longer, as something was added to them: what rounding made of them
+        counts as dark noise."""
+        own = self.dark_noise if isinstance(self.dark_noise, tuple) else (self.dark_noise,)
+        dark = tuple(math.sqrt(d**2 + self.quantisation**2 / 12) for d in own)
+        return replace(self, dark_noise=dark if isinstance(self.dark_noise, tuple) else dark[0], quantisation=0.0)
+
     def fixed_pattern(self, shape: Sequence[int], rng: np.random.Generator) -> np.ndarray:
         """A gain per pixel, relative, of rms `prnu`; make it once per camera and hand it to every `expose`."""
         return self.prnu * rng.standard_normal(shape)

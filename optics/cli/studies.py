@@ -426,7 +426,7 @@ def imitate(
             help="Write the measured images, changed by what --set changes; they keep all that the model lacks.",
         ),
     ] = False,
-    seed: Annotated[int, typer.Option(help="Seed of the noise.")] = 1,
+    seed: Annotated[int, typer.Option(help="Seed of the noise of simulated images.")] = 1,
     plugins: Plugins = None,
     captures: CapturesNow = None,
 ) -> None:
@@ -439,4 +439,5 @@ def imitate(
     check_new_folder(output)
     found = Study.open(study, plugins=plugins, captures=captures)
     folder = found.imitate(output, settings(sets), seed=seed, into_captures=into_captures)
-    print(f"{folder}: optics calibrate {output} -o ANOTHER_STUDY")
+    start = f" --fit {study}" if into_captures else ""
+    print(f"{folder}: optics calibrate {output}{start} -o ANOTHER_STUDY")

@@ -10,7 +10,7 @@ one comes first, and by how much:
     as        the effect that comes first most often where the hidden one does not
 
 Linear in the effect and in the base, with the camera's noise only: clutter and nonlinear effects do worse. `imitate`
-makes captures for the whole loop.
+makes captures for the whole loop, of the model alone or of the measured images.
 
 Source: the idea is that of "make_perfect_observations" in mrcal.
 """
@@ -27,6 +27,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optics.captures import capture_set as capture_files
+from optics.captures.noise import Noise
 from optics.diagnosis import statistics as st
 from optics.diagnosis.evidence import Progress
 from optics.diagnosis.score import score
@@ -169,36 +170,51 @@ def rehearse(
 def imitate(
     model: SceneModel, values: Values, folder: str | Path, seed: int = 0, measured_at: Values | None = None
 ) -> Path:
-    """Write captures as this model predicts them at these values, with its camera's noise and its frames' settings.
+    """Write captures as this model predicts them at these values, with its camera's noise and its frames' settings; or
+    the measured images, changed by what the model says that these values change.
 
-    They show what a residual would look like, and what the loop concludes from it. They prove nothing about the model,
-    which made them. Raises BadCapture for readings in a table, and as `optics.captures.capture_set.write`.
+    Simulated images show what a residual would look like, and what the loop concludes from it. They prove nothing about
+    the model, which made them. Measured ones keep their own noise and all that the model lacks.
 
-    measured_at   values that describe the measured images: these are then written with what the change from there
-                  makes of a prediction, in DN, and keep their own noise and all that the model lacks; what their
-                  import advises goes with them
-    """
+    measured_at   values at which the model describes the measured images: to each the difference of the predictions at
+                  `values` and at these is added, in DN, and import.json goes along, since what it advises still holds.
+                  None: images are simulated
+
+    Raises BadCapture for readings in a table, where measured images would not change, and as
+    `optics.captures.capture_set.write`."""
     captures = model.captures
     if captures.table is not None:
         raise BadCapture(
             f"{captures.folder}: readings in a table cannot be imitated; allowed: images; `optics rehearse` works "
             "for both"
         )
-    rng = np.random.default_rng([seed, 31])
-    before = [None] * len(model.frames) if measured_at is None else model.predict(measured_at)
+    signals = model.predict(values)
+    if measured_at is None:
+        rng, noise = np.random.default_rng([seed, 31]), model.noise
+        images = [noise.expose(signal, rng) for signal in signals]
+    else:
+        noise = model.noise.unrounded()
+        changes = [after - before for after, before in zip(signals, model.predict(measured_at))]
+        if not any(np.any(change) for change in changes):
+            raise BadCapture(
+                f"{captures.folder}: none of the images would change; allowed: --set of what acts in these frames "
+                "and is not set or found in each of them, such as --set camera.vignetting=0.3"
+            )
+        images = [_added(model.noise, f.image, change) for f, change in zip(model.frames, changes)]
     frames = []
-    for index, (frame, signal, old) in enumerate(zip(model.frames, model.predict(values), before)):
-        if old is None:
-            image = model.noise.expose(signal, rng)
-        else:  # what is masked, such as a saturated value, stays as it is
-            image = np.where(model.usable(index), frame.image + (signal - old), frame.image)
+    for frame, image in zip(model.frames, images):
         image = image.astype(np.float32)
         if captures.cfa is not None:
             image = np.take_along_axis(image, capture_files.cfa_channel(image.shape, captures.cfa)[..., None], axis=2)
         frames.append(replace(frame, image=image, repeats=[]))
-    whole = measured_at is None and model.noise.quantisation == 1 and float(model.noise.saturation).is_integer()
-    bits = None if not whole else 8 if model.noise.saturation <= 255 else 16
-    written = capture_files.write(replace(captures, frames=frames, noise=model.noise, warnings=[]), folder, bits=bits)
+    whole = noise.quantisation == 1 and float(noise.saturation).is_integer()
+    bits = None if not whole else 8 if noise.saturation <= 255 else 16
+    written = capture_files.write(replace(captures, frames=frames, noise=noise, warnings=[]), folder, bits=bits)
     if measured_at is not None and (advice := captures.folder / "import.json").is_file():
         shutil.copyfile(advice, written / advice.name)
     return written
+
+
+def _added(noise: Noise, image: np.ndarray, change: np.ndarray) -> np.ndarray:
+    """A measured image with a change; what is cut off, at saturation or at black, says nothing and stays."""
+    return np.where(noise.usable(image, 0), np.minimum(image + change, noise.saturation), image)

@@ -355,7 +355,7 @@ class Descent:
     def scale(self) -> bool:
         """Solve for the powers alone on the images of `linearise`, and move there if one of them is off by more than
         SCALED: of readings in volts or in 12 bits nobody knows the scale, and all other images are proportional to it.
-        Not where it is a hundredth of what a step of all brings: a faint lamp may be off by any factor.
+        Not where this gains less than a hundredth of what a full step promises: a faint lamp may be off by any factor.
         Returns whether theta has moved."""
         if not self.powers:
             return False
@@ -366,7 +366,7 @@ class Descent:
         if not np.any((new > SCALED * old) | (old > SCALED * new)):
             return False
         change = new - old
-        if own.b @ change - change @ own.a @ change / 2 < self.promised / 100:
+        if 2 * own.b @ change - change @ own.a @ change < LITTLE * self.promised:
             return False
         self.theta, self.values = moved, self.moved(self.values, moved)
         return True

@@ -462,8 +462,9 @@ class SceneModel:
             acts = self._acts(values, variable, index)
             if not acts:
                 continue
-            samples = seed if self._by_chance(now, acts) else 0
-            key = None if at is None else (samples, secant.get(variable.name), variable.frames, *acts.items(), *at)
+            # 0 where no seed matters, so that a second one finds the image of the first
+            own_seed = seed if self._depends_on_seed(now, acts) else 0
+            key = None if at is None else (own_seed, secant.get(variable.name), variable.frames, *acts.items(), *at)
             image: Any
             if key in self._derived:
                 self._derived.move_to_end(key)
@@ -512,8 +513,8 @@ class SceneModel:
         crowds = self.renderer.geometry(now) if self.renderer.crowded else ()  # bodies may have been put elsewhere
         return index, self.renderer.wanted, *crowds, *sorted(now.items())
 
-    def _by_chance(self, now: Mapping, keys: Iterable[str]) -> bool:
-        """Whether other samples give another derivative by these keys."""
+    def _depends_on_seed(self, now: Mapping, keys: Iterable[str]) -> bool:
+        """Whether the derivative image by these keys is another for another seed."""
         second = self.renderer.bounce_key
         return self.monte_carlo or self.sampled or bool(second and (now[second] or second in keys))
 

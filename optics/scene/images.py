@@ -34,8 +34,8 @@ def bend(image: np.ndarray, rim: np.ndarray) -> np.ndarray:
         if image.shape[axis] < 3:
             continue
         first, last, inner, before, after = (
-            (slice(None),) * axis + (own,)
-            for own in (slice(1, None), slice(None, -1), slice(1, -1), slice(None, -2), slice(2, None))
+            (slice(None),) * axis + (part,)
+            for part in (slice(1, None), slice(None, -1), slice(1, -1), slice(None, -2), slice(2, None))
         )
         known, count = np.zeros((2, *rim.shape), image.dtype)
         known[inner] = ~(rim[before] | rim[inner] | rim[after])
@@ -73,7 +73,7 @@ def repeated(image: np.ndarray, side: int) -> np.ndarray:
 
 def of_pixels(image: np.ndarray, side: int) -> np.ndarray:
     """(..., H, W, B): mean of the parts of each pixel of an image (..., side H, side W, B)."""
-    # slice by slice: a mean over axes of two takes numpy four times as long
+    # slice by slice: numpy's mean over axes of length `side` is four times as slow
     parts = [image[..., i::side, j::side, :] for i in range(side) for j in range(side)]
     return sum(parts[1:], parts[0]) / side**2
 

@@ -354,8 +354,10 @@ class Scene:
         meshes = False leaves the meshes of crowds for when `mitsuba` is asked for: enough for `traced`."""
         import mitsuba as mi
 
-        now = self.values()  # as checked before
-        changed = self.check({k: v for k, v in values.items() if k not in now or now[k] != v}, where)
+        now = self.values()
+        # what a parameter has already needs no check: most of what a calibration sets is of this kind
+        new = {k: v for k, v in values.items() if k not in now or type(v) is not type(now[k]) or now[k] != v}
+        changed = {k: v for k, v in self.check(new, where).items() if now[k] != v}
         moved, stock = set(), False
         for key, value in changed.items():
             if key in self._stock:

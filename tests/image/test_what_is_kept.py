@@ -99,8 +99,8 @@ def test_large_images_push_out_no_more_than_they_take(scene, monkeypatch):
 
 
 @pytest.mark.parametrize("share", (0.0, 0.5))
-def test_of_another_seed_only_what_is_drawn_is_made_again(scene, share):
-    """Another seed is there for light reflected twice, and for what its image is a part of."""
+def test_a_second_seed_renders_only_what_depends_on_it(scene, share):
+    """The image of light reflected twice; and where there is such light, all images that it is a part of."""
     shape = (int(SMALL["height"]), int(SMALL["width"]), 3)
     frame = Frame("press", np.zeros(shape, np.float32), parameters={"gel.press_depth": 0.8})
     model = SceneModel(scene, Captures(Path("."), str(scene.path), [frame], noise=Noise(0.1, 1.0, 0.0, 255.0, 0.0)))

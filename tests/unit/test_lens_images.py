@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.special import erf
 
-from optics.scene.images import bend, blurred, magnified
+from optics.scene.images import bend, blurred, magnified, of_pixels
 
 WIDTH, HEIGHT, SD = 40, 30, 1.1  # px; of a spot's Gaussian
 
@@ -79,3 +79,21 @@ def test_what_bends_smoothly_has_its_mean_by_second_differences():
     assert (off[~rim] == 2).all()
     rim[:, ::2] = rim[::2] = True
     assert (bend(edge[..., None], rim) == 0).all()
+
+
+@pytest.mark.parametrize("kind", [np.float32, complex])
+def test_second_differences_go_around_rims_and_on_beyond_borders(kind):
+    """Of x^2 + 3 y^2 they are 2 + 6 everywhere; a pixel at a rim, which is anything, changes none of them."""
+    y, x = np.mgrid[:9, :11]
+    image = np.stack([x**2 + 3 * y**2, 0 * x], -1).astype(kind)
+    rim = np.zeros((9, 11), bool)
+    expected = np.broadcast_to([8.0, 0.0], image.shape)
+    assert bend(image, rim) == pytest.approx(expected) and bend(image, rim).dtype == kind
+    image[4, 6], rim[4, 6] = 1000.0, True
+    assert bend(image, rim)[~rim] == pytest.approx(expected[~rim])
+    assert bend(image[:2], rim[:2]) == pytest.approx(expected[:2] - [6.0, 0.0])  # two rows have no second difference
+
+
+def test_a_pixel_is_the_mean_of_its_parts():
+    parts = np.arange(2 * 6 * 9 * 2).reshape(2, 6, 9, 2) * (1 + 2j)
+    assert of_pixels(parts, 3) == pytest.approx(parts.reshape(2, 2, 3, 3, 3, 2).mean((-4, -2)))

@@ -3,13 +3,18 @@ was
 really hidden."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from optics.diagnosis.rehearse import rehearse
+from optics.captures import capture_set as capture_files
+from optics.captures.noise import Noise
+from optics.diagnosis.rehearse import imitate, rehearse
 from optics.diagnosis.score import score
+from optics.errors import BadCapture
 
 sys.path.insert(0, str(Path(__file__).parent))
 from mock_model import LIBRARY, MockModel, mock_fit, simulate
@@ -105,3 +110,35 @@ def test_it_reads_as_a_table(model):
     text = found.text()
     assert all(r.effect in text for r in found.rows) and "0.5 %" in text and "never named" in text
     assert {r.effect for r in found.rows} | set(found.unseen) == {e.name for e in LIBRARY}
+
+
+class Brighter:
+    """A model whose image is what was measured, and grows by so many DN; its region leaves half of it out."""
+
+    def __init__(self, captures, images):
+        self.captures, self.noise, self.images = captures, captures.noise, images
+        self.frames = [replace(f, image=image) for f, image in zip(captures.frames, images)]
+
+    def predict(self, values):
+        return [image + values.more for image in self.images]
+
+
+@pytest.mark.parametrize("cfa", [None, "RGGB"])
+def test_measured_images_change_by_what_a_model_says_and_keep_their_noise(tmp_path, cfa):
+    """All but what is cut off at saturation and at black; a mosaic in its own channels."""
+    rng = np.random.default_rng(0)
+    noise = Noise(system_gain=0.1, dark_noise=0.8, black_level=0.0, saturation=255.0, prnu=0.0)
+    image = np.round(rng.uniform(20, 200, (12, 16, 1 if cfa else 3)))
+    image[2:4, 3:5], image[7, 7] = 255.0, 0.0
+    frame = capture_files.Frame("one", image.astype(np.float32))
+    captures = capture_files.Captures(tmp_path, "digit", [frame], noise=noise, cfa=cfa)
+    model = Brighter(captures, [np.repeat(image, 3, axis=2) if cfa else image])
+    before = SimpleNamespace(more=0.0)
+    folder = imitate(model, SimpleNamespace(more=0.25), tmp_path / "out", measured_at=before)
+    found = capture_files.load(folder)
+    cut = (image == 0) | (image == 255)
+    assert np.array_equal(found.frames[0].image, np.where(cut, image, image + 0.25))
+    signal = np.array([[[5.0], [100.0]]])
+    assert found.noise.variance(signal) == pytest.approx(noise.variance(signal))  # with what was rounded
+    with pytest.raises(BadCapture, match="none of the images would change"):
+        imitate(model, before, tmp_path / "same", measured_at=before)
