@@ -355,7 +355,8 @@ class Descent:
     def scale(self) -> bool:
         """Solve for the powers alone on the images of `linearise`, and move there if one of them is off by more than
         SCALED: of readings in volts or in 12 bits nobody knows the scale, and all other images are proportional to it.
-        Not where this gains less than a hundredth of what a full step promises: a faint lamp may be off by any factor.
+        Not where those that are gain less than a hundredth of what a full step promises: a faint lamp may be off by any
+        factor.
         Returns whether theta has moved."""
         if not self.powers:
             return False
@@ -363,10 +364,9 @@ class Descent:
         own = Normal(here.a[np.ix_(index, index)], here.b[index], 0.0, 0.0, [], [], [])
         moved = self._solved(own, self.theta)
         old, new = self.theta[index], moved[index]
-        if not np.any((new > SCALED * old) | (old > SCALED * new)):
-            return False
-        change = new - old
-        if 2 * own.b @ change - change @ own.a @ change < LITTLE * self.promised:
+        far = (new > SCALED * old) | (old > SCALED * new)
+        change = np.where(far, new - old, 0.0)
+        if not far.any() or 2 * own.b @ change - change @ own.a @ change < LITTLE * self.promised:
             return False
         self.theta, self.values = moved, self.moved(self.values, moved)
         return True
