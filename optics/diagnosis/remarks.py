@@ -12,18 +12,19 @@ from optics.captures import noise as camera_noise
 from optics.diagnosis import statistics as st
 from optics.diagnosis.decide import CURVE, Findings
 from optics.diagnosis.evidence import Candidate, Evidence, at_bound, measure, priors
-from optics.diagnosis.explanations import Outcome, Trial
+from optics.diagnosis.explanations import Outcome, Trial, wander_of
 from optics.diagnosis.refit import Case
 from optics.diagnosis.result import NAMED, Basis, Condition, Shift, Split
 from optics.diagnosis.score import KAPPA, Table
 from optics.diagnosis.text import AT_FAULT, leaves_misfit, left_of, moved_by
 from optics.diagnosis.thresholds import CLEAR, EXCESS, LEVEL
 from optics.fit.model import value_of
-from optics.words import some
+from optics.words import percent, some
 
 SLIGHT = 0.05  # rms change over the mean signal, within which images of other effects stay as they were to a twentieth
 RENDER_NOISE = 0.01  # of the camera's variance: Monte Carlo noise above it weakens every test
 SMOOTH = 0.7  # of the noise expected in fine detail: below, neighbouring pixels share their noise
+SWUNG = 0.1  # of the excess: what a lamp makes of more than that is told
 REPEATABLE = 1000  # times as many frames: above, repeats are no advice
 # where no shot was simulated
 USUALLY = "the same press at 0.4 of the exposure, and one deeper press, often tell more than repeats"
@@ -197,6 +198,24 @@ def warnings_of(
             + some([moved_by(s) for s in moved], 3)
         )
     return texts
+
+
+def of_lamp(case: Case, outcome: Outcome, basis: Basis) -> str:
+    """What a lamp did to whole frames, where the best explanation of images takes much of the misfit for that: the
+    verdict counts it as noise, and its reader may not."""
+    best = outcome.best
+    if case.evidence.is_table or case.lamp is None or best.by_frame or not best.members:
+        return ""
+    share = best.gain * outcome.scale / max(basis.chi2 - basis.dof, 1.0)
+    if not share > SWUNG:
+        return ""
+    names = [c.effect.name for c in case.table.order if c.effect.scope == "frame"]
+    more = f" If no lamp did that, add {some(names)} and diagnose again." if names else ""
+    return (
+        f"Beside it whole frames are brighter or darker by {percent(wander_of(case, outcome, best))} (rms), which is "
+        f"{percent(min(share, 1.0), 2)} of the excess and counts as noise: a lamp or an exposure that changes from frame "
+        f"to frame.{more}"
+    )
 
 
 def hints_of(

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from optics.diagnosis import diagnose, dials_as_rival, explanations, findings, held_out, laws, refit, score
+from optics.diagnosis import diagnose, dials_as_rival, explanations, findings, held_out, laws, refit, remarks, score
 from optics.diagnosis import statistics as st
 from optics.diagnosis.correlation import NOTICED, Correlation, Readings
 from optics.diagnosis.result import Law
@@ -603,3 +603,18 @@ def test_what_is_surely_a_hundredth_of_the_excess_is_a_detail(share, excess_sd, 
     assert findings._is_detail(own) is detail
     assert not findings._is_detail(SimpleNamespace(share=math.nan, excess_sd=792.0, weighed=True))
     assert not findings._is_detail(SimpleNamespace(share=share, excess_sd=excess_sd, weighed=False))
+
+
+@pytest.mark.parametrize("gain, by_frame, told", [(800.0, False, True), (60.0, False, False), (800.0, True, False)])
+def test_a_lamp_that_takes_much_of_the_misfit_is_told(monkeypatch, gain, by_frame, told):
+    """Brightness of whole frames was most of the misfit of a real sensor, and its verdict spoke of another effect
+    alone."""
+    monkeypatch.setattr(remarks, "wander_of", lambda case, outcome, trial: 0.0104)
+    scopes = {"gain drift": "frame", "gel bulge": "common"}
+    order = [SimpleNamespace(effect=SimpleNamespace(name=n, scope=s)) for n, s in scopes.items()]
+    case = SimpleNamespace(evidence=SimpleNamespace(is_table=False), lamp=object(), table=SimpleNamespace(order=order))
+    best = SimpleNamespace(by_frame=by_frame, members=[order[1]], gain=gain)
+    text = remarks.of_lamp(case, SimpleNamespace(best=best, scale=1.5), SimpleNamespace(chi2=3000.0, dof=1000.0))
+    assert bool(text) is told
+    if told:
+        assert "by 1.04 % (rms), which is 60 % of the excess" in text and "add gain drift" in text
