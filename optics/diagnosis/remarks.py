@@ -211,10 +211,11 @@ def of_lamp(case: Case, outcome: Outcome, basis: Basis) -> str:
         return ""
     names = [c.effect.name for c in case.table.order if c.effect.scope == "frame"]
     more = f" If no lamp did that, add {some(names)} and diagnose again." if names else ""
+    swing = percent(wander_of(case, outcome, best))
     return (
-        f"Beside it whole frames are brighter or darker by {percent(wander_of(case, outcome, best))} (rms), which is "
-        f"{percent(min(share, 1.0), 2)} of the excess and counts as noise: a lamp or an exposure that changes from frame "
-        f"to frame.{more}"
+        f"Besides, whole frames are brighter or darker than predicted by {swing} (rms), which is "
+        f"{percent(min(share, 1.0), 2)} of the excess and counts as noise: a lamp or an exposure that changes from "
+        f"frame to frame.{more}"
     )
 
 
