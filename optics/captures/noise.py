@@ -159,21 +159,24 @@ class Noise:
 
         The gain in DN per electron stays, the quantisation of all frames but one is counted as dark noise.
         """
-        own = self.dark_noise if isinstance(self.dark_noise, tuple) else (self.dark_noise,)
-        dark = tuple(math.sqrt(frames * d**2 + (frames - 1) * self.quantisation**2 / 12) for d in own)
         return replace(
             self,
-            dark_noise=dark if isinstance(self.dark_noise, tuple) else dark[0],
+            dark_noise=self._dark_with_rounding(frames, frames - 1),
             black_level=frames * self.black_level,
             saturation=frames * self.saturation,
         )
 
     def unrounded(self) -> Noise:
-        """Noise of values that were whole and are no longer, as something was added to them: what rounding made of them
-        counts as dark noise."""
-        own = self.dark_noise if isinstance(self.dark_noise, tuple) else (self.dark_noise,)
-        dark = tuple(math.sqrt(d**2 + self.quantisation**2 / 12) for d in own)
-        return replace(self, dark_noise=dark if isinstance(self.dark_noise, tuple) else dark[0], quantisation=0.0)
+        """Noise of whole values to which a fraction was added: their rounding error counts as dark noise."""
+        return replace(self, dark_noise=self._dark_with_rounding(1, 1), quantisation=0.0)
+
+    def _dark_with_rounding(self, frames: int, roundings: int) -> float | tuple[float, ...]:
+        """Dark noise of the sum of so many frames, with the error of so many roundings."""
+
+        def of(dark: float) -> float:
+            return math.sqrt(frames * dark**2 + roundings * self.quantisation**2 / 12)
+
+        return tuple(map(of, self.dark_noise)) if isinstance(self.dark_noise, tuple) else of(self.dark_noise)
 
     def fixed_pattern(self, shape: Sequence[int], rng: np.random.Generator) -> np.ndarray:
         """A gain per pixel, relative, of rms `prnu`; make it once per camera and hand it to every `expose`."""

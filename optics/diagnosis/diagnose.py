@@ -194,7 +194,7 @@ def diagnose(
         kinds.append([findings.fragile])
     hints = remarks.hints_of(word, conditions, outcome, findings, gaps, names)
     text = sentence(word, conditions, findings, rows, told, fingerprints, levels, shifts, basis)
-    text = " ".join(filter(None, [text, remarks.of_lamp(case, outcome, basis)]))
+    text = " ".join(filter(None, [text, remarks.lamp_text(case, outcome, basis)]))
     if word in ("UNKNOWN", "CANNOT_TELL"):
         text, first = _unexplained(case, word, text, fingerprints, families, findings, basis)
         hints = [*first, *hints]

@@ -24,7 +24,7 @@ from optics.words import percent, some
 SLIGHT = 0.05  # rms change over the mean signal, within which images of other effects stay as they were to a twentieth
 RENDER_NOISE = 0.01  # of the camera's variance: Monte Carlo noise above it weakens every test
 SMOOTH = 0.7  # of the noise expected in fine detail: below, neighbouring pixels share their noise
-SWUNG = 0.1  # of the excess: what a lamp makes of more than that is told
+SWUNG = 0.1  # of the excess: a lamp that makes more of it is mentioned
 REPEATABLE = 1000  # times as many frames: above, repeats are no advice
 # where no shot was simulated
 USUALLY = "the same press at 0.4 of the exposure, and one deeper press, often tell more than repeats"
@@ -200,11 +200,13 @@ def warnings_of(
     return texts
 
 
-def of_lamp(case: Case, outcome: Outcome, basis: Basis) -> str:
-    """What a lamp did to whole frames, where the best explanation of images takes much of the misfit for that: the
-    verdict counts it as noise, and its reader may not."""
+def lamp_text(case: Case, outcome: Outcome, basis: Basis) -> str:
+    """A sentence on what a lamp did to whole frames, where that is much of the misfit of images: a verdict counts it as
+    noise, which its reader would not see. Empty elsewhere, also where there is no excess to share."""
     best = outcome.best
     if case.evidence.is_table or case.lamp is None or best.by_frame or not best.members:
+        return ""
+    if not basis.excess_sd > EXCESS:
         return ""
     share = best.gain * outcome.scale / max(basis.chi2 - basis.dof, 1.0)
     if not share > SWUNG:

@@ -506,8 +506,8 @@ class SceneModel:
             self._keep_derived(key, image)
 
     def _place_of(self, now: Mapping, index: int) -> tuple | None:
-        """What a derivative image of a frame depends on besides its variable and its samples; None: images of readings
-        are not kept."""
+        """What a derivative image of a frame depends on besides its variable and the seed; None: images of readings are
+        not kept."""
         if self.captures.table is not None:
             return None
         crowds = self.renderer.geometry(now) if self.renderer.crowded else ()  # bodies may have been put elsewhere

@@ -113,7 +113,7 @@ def test_it_reads_as_a_table(model):
 
 
 class Brighter:
-    """A model whose image is what was measured, and grows by so many DN; its region leaves half of it out."""
+    """A model whose image is what was measured, brighter by so many DN."""
 
     def __init__(self, captures, images):
         self.captures, self.noise, self.images = captures, captures.noise, images

@@ -1,4 +1,4 @@
-"""What a scene accepts as a value, also where it is, as a number, the one that a parameter has."""
+"""What a scene refuses as a value, also where it equals the value that a parameter has."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ from optics.scene import loader
         ("led_1.pow", 1.0, UnknownKey),
     ],
 )
-def test_a_value_that_is_none_is_refused_by_its_key(mitsuba, key, value, error):
+def test_what_is_no_value_is_refused_by_its_key(mitsuba, key, value, error):
     scene = loader.load("gelsight", {"width": "8", "height": "6"})
     assert scene.values()["led_1.power"] == 1.0
     with pytest.raises(error, match=key.replace(".", r"\.")):

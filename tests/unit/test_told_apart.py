@@ -605,16 +605,28 @@ def test_what_is_surely_a_hundredth_of_the_excess_is_a_detail(share, excess_sd, 
     assert not findings._is_detail(SimpleNamespace(share=share, excess_sd=excess_sd, weighed=False))
 
 
-@pytest.mark.parametrize("gain, by_frame, told", [(800.0, False, True), (60.0, False, False), (800.0, True, False)])
-def test_a_lamp_that_takes_much_of_the_misfit_is_told(monkeypatch, gain, by_frame, told):
-    """Brightness of whole frames was most of the misfit of a real sensor, and its verdict spoke of another effect
-    alone."""
+@pytest.mark.parametrize(
+    "gain, by_frame, excess_sd, told",
+    [
+        (800.0, False, 44.7, True),
+        (60.0, False, 44.7, False),  # a twentieth of the excess
+        (800.0, True, 44.7, False),  # each frame has a gain
+        (800.0, False, 1.0, False),  # noise, of which there is no share
+    ],
+)
+def test_a_lamp_that_takes_much_of_the_misfit_is_mentioned(monkeypatch, gain, by_frame, excess_sd, told):
+    """In images of a real sensor whose gains had been made to scatter, brightness of whole frames was most of the
+    misfit, and the verdict spoke of another effect alone."""
     monkeypatch.setattr(remarks, "wander_of", lambda case, outcome, trial: 0.0104)
     scopes = {"gain drift": "frame", "gel bulge": "common"}
     order = [SimpleNamespace(effect=SimpleNamespace(name=n, scope=s)) for n, s in scopes.items()]
     case = SimpleNamespace(evidence=SimpleNamespace(is_table=False), lamp=object(), table=SimpleNamespace(order=order))
     best = SimpleNamespace(by_frame=by_frame, members=[order[1]], gain=gain)
-    text = remarks.of_lamp(case, SimpleNamespace(best=best, scale=1.5), SimpleNamespace(chi2=3000.0, dof=1000.0))
+    text = remarks.lamp_text(
+        case,
+        SimpleNamespace(best=best, scale=1.5),
+        SimpleNamespace(chi2=3000.0, dof=1000.0, excess_sd=excess_sd),
+    )
     assert bool(text) is told
     if told:
         assert "by 1.04 % (rms), which is 60 % of the excess" in text and "add gain drift" in text
