@@ -13,7 +13,7 @@ from optics.scene.parameter import Values
 
 if TYPE_CHECKING:
     from optics.fit.scene_model import SceneModel
-    from optics.light.renderer import Hits
+    from optics.light.samples import Hits
 
 DISTANCES = 8  # LEDs up to which the distance to each is a coordinate of its own: more would be as many fine maps
 FLAT = 1.0  # deg of slope below which the direction of the slope is noise

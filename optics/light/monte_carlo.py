@@ -13,7 +13,8 @@ import numpy as np
 
 from optics.light import paths
 from optics.light.development import STEP
-from optics.light.renderer import LedImage, Renderer
+from optics.light.renderer import Renderer
+from optics.light.samples import LedImage
 from optics.light.transport import Estimate, Transport
 from optics.scene.loader import Scene
 from optics.scene.surfaces import coefficient

@@ -19,12 +19,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import repeat
 from types import SimpleNamespace
-from typing import NamedTuple
 
 import numpy as np
 
-from optics.errors import BadScene
+from optics.errors import BadPlugin, BadScene
 from optics.light import paths
+from optics.light.samples import Finer, Hits, LedImage, Sample, around, creases, edges
+from optics.light.together import Apart, Group, alike
 from optics.processes import return_memory
 from optics.scene.images import bend, finer_of, from_parts, in_parts, repeated
 from optics.scene.loader import Scene
@@ -45,12 +46,8 @@ LAYERED_RIM_SAMPLES = 32  # in scenes with layers, whose matrices are multiplied
 # samples: the square of these is six times that of the image. By 2 mm^2 it is less than that
 CROWDED_PUPIL = 2.0
 PAINTED = 0.05  # of the largest reflectance of a texture: a step from pixel to pixel that needs finer samples
-# difference of a pixel's mean normal from that at its middle, above which finer samples are taken: a fifth of a grey
-# level in 200
-BENT = 1e-3
 BENT_SIDE = 4  # finer samples each way where the face bends: the mean of what varies smoothly needs few
 SOFT = 25  # points of a light, above which rims of its shadows take the samples of what bends, BENT_SIDE each way
-CREASE = 25.0  # deg from pixel to pixel: what is no smooth surface
 R2 = 0.7548776662466927, 0.5698402909980532  # of the R2 sequence: shifts from pixel to pixel
 MOVES = ("light x", "light y", "light z", "light turn")  # roles of a light's parameters that move it
 CORNERS = np.array([[0.5, 0.5], [0.02, 0.02], [0.98, 0.02], [0.02, 0.98], [0.98, 0.98]]).T  # of a pixel
@@ -58,6 +55,7 @@ FLAT_FIELDS = ("multiplicative", "additive", "none")
 MEMORY = 2e9  # bytes of hits, with what images need for their derivatives, that are kept
 IMAGES = 5e8  # bytes of images that are kept without them, of a renderer that remembers REMEMBER geometries
 REMEMBER = 24
+TOGETHER = 200_000  # pixels of all LEDs that are rendered at once, at most: of larger images, computing takes the time
 AT_ONCE = 4_000_000  # ends of camera rays times parameters whose tangents are made together
 PER_RAY = 250  # bytes of a camera ray's end and its light, by the memory of processes that held ten million of them
 BOUNCE_SAMPLES = 32  # directions per cell for the second bounce, at least
@@ -189,6 +187,7 @@ class Renderer:
         self.asked: set[str] = set()  # parameters whose tangents will be asked for, see `asking`
         self._slopes: dict[tuple, tuple[LedImage, dict[str, tuple]]] = {}  # those that were made with others
         self.wanted: Pixels | None = None  # those that take finer samples where they need them; None: all
+        self.apart = False  # whether something of the scene must be asked of each LED by itself
         self.side = 1  # values of a pixel each way, see `splitting`
         self.passing = self.roughly = False  # whether nothing but images is kept, see `in_passing`
 
@@ -321,7 +320,7 @@ class Renderer:
         hits = Hits(self._trace(u.ravel(), v.ravel()), self.height, self.width)
         hits.eye = self._eye()
         if self.crowded:
-            hits.edges |= _creases(np.where(hits.valid[..., None], hits.normal, 0.0)) | self._parted(values)
+            hits.edges |= creases(np.where(hits.valid[..., None], hits.normal, 0.0)) | self._parted(values)
         hits.edges |= self._painted(hits)
         self._hits[key] = hits
         while len(self._hits) > self.remember:
@@ -388,7 +387,7 @@ class Renderer:
         import drjit as dr
         import mitsuba as mi
 
-        edges = np.zeros(hits.shape, bool)
+        found = np.zeros(hits.shape, bool)
         for m in self.scene.membranes.values():
             if not m.reflectance.is_spatially_varying():
                 continue
@@ -399,9 +398,9 @@ class Renderer:
                 np.broadcast_to(np.array(paint), hits.valid.size).reshape(hits.shape),
             )
             if own.any():
-                low, high = _around(np.where(own, paint, paint[own].mean()))
-                edges |= high - low > PAINTED * paint[own].max()
-        return edges
+                low, high = around(np.where(own, paint, paint[own].mean()))
+                found |= high - low > PAINTED * paint[own].max()
+        return found
 
     # -- one LED ------------------------------------------------------------------------------------------------------
     def _led_key(self, values: Mapping, led: str, seed: int = 0) -> tuple:
@@ -430,14 +429,16 @@ class Renderer:
             self.apply(values, move=False)
             return self._keep(key, self._shaded_again(alike))
         self.apply(values)
-        image = self._keep(key, self._render_led(hits, led, seed))
-        for other in self.together - {
-            led
-        }:  # moving the geometry costs more than an image: make what will be asked for next
-            key = self._image_key(values, other, seed)
-            if key not in self._images and self._plain_key(key) not in self._plain:
-                self._keep(key, self._render_led(hits, other, seed))
-        return image
+        # moving the geometry costs more than an image: make what will be asked for next
+        keys = {led: key}
+        for other in sorted(self.together - {led}):
+            own = self._image_key(values, other, seed)
+            if own not in self._images and self._plain_key(own) not in self._plain:
+                keys[other] = own
+        found = self._render(hits, list(keys), seed)
+        for name, own in keys.items():
+            self._keep(own, found[name])
+        return found[led]
 
     def _plain_key(self, key: tuple) -> tuple:
         """The key of a plain image as finely as images are wanted."""
@@ -491,6 +492,32 @@ class Renderer:
             self._plain_bytes -= self._plain.popitem(last=False)[1].nbytes
         return image
 
+    def _render(self, hits: Hits, leds: Sequence[str], seed: int) -> dict[str, LedImage]:
+        """LED -> its image over one geometry; of alike ones at once, where images are small."""
+        found: dict[str, LedImage] = {}
+        for names in self._alike(hits, leds):
+            if len(names) > 1:
+                try:
+                    found.update(self._render_together(hits, names))
+                    continue
+                except (Apart, BadPlugin):  # what is wrong with a plugin shows again, LED by LED
+                    self.apart = True
+            found.update((name, self._render_led(hits, name, seed)) for name in names)
+        return found
+
+    def _alike(self, hits: Hits, leds: Sequence[str]) -> list[list[str]]:
+        """The LEDs in groups that are rendered at once."""
+        most = TOGETHER // hits.valid.size
+        if self.apart or self.layered or self.crowded or self.integral is not None or min(most, len(leds)) < 2:
+            return [[name] for name in leds]
+        from optics.light.led_by_led import is_interface
+
+        faces = [s.bbox().max.z for s in self._world().shapes() if is_interface(s)]
+        lights = [self.scene.leds[name] for name in leds if name in self.scene.leds]
+        groups = [[light.name for light in own] for own in alike(lights, faces)]
+        groups += [[name] for name in leds if name not in self.scene.leds]
+        return [own[i : i + most] for own in groups for i in range(0, len(own), most)]
+
     def _render_led(self, hits: Hits, led: str, seed: int = 0) -> LedImage:
         if led in self.scene.sources:  # what it sends lies in the weights
             rim = self._joint_rim(hits)
@@ -498,27 +525,71 @@ class Renderer:
             image = LedImage(led, hits, rim, index, self._finer(hits, index), None, None, hits.valid)
             own = np.zeros((1, self.bands))
             own[:, self._own(led)] = 1.0
-            image.raw = (own, own)
+            image.raw = own, (own if len(index) else None)
             return image
         if self.crowded:
             return self._render_crowded(hits, led, seed)
         part = self.scene.leds[led]
         visible = self._unshaded(hits, part)
-        rim = self._joint_rim(hits) if self.layered else self._rim(hits, visible)
+        rim = self._joint_rim(hits) if self.layered else self._rim(hits, self._seen(visible))
+        index, bent, share = self._sampled(hits, part, rim)
+        finer = self._finer(hits, index, bent)
+        rim_visible = self._visible(finer.sample.si, part) if len(index) else None
+        image = LedImage(led, hits, rim, index, finer, visible, rim_visible, self._seen(visible).mean(0) > 0.5)
+        image.share = share
+        image.raw = self._direct(image)
+        if not self.layered:
+            image.radiance = self._mix(image, image.raw)
+        return image
+
+    def _sampled(self, hits: Hits, part, rim: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(numbers of the pixels that take finer samples of an LED's light, which of them take few, (n, 1) share by
+        which these stand for the pixel)."""
         share = np.where(rim, 1.0, hits.bent)
         if self.wanted is not None:
             share = np.where(self.wanted.mask, share, 0.0)
         index = np.flatnonzero(share)
         # of a light of many points, an edge in the shadow of one is small
         few = ~(hits.edges if len(part.places()) > SOFT else rim)
-        finer = self._finer(hits, index, np.flatnonzero(few.ravel()[index]))
-        rim_visible = self._visible(finer.sample.si, part) if len(index) else None
-        image = LedImage(led, hits, rim, index, finer, visible, rim_visible, self._seen(visible).mean(0) > 0.5)
-        image.share = share.reshape(-1, 1)[index]
-        image.raw = self._direct(image)
-        if not self.layered:
+        return index, np.flatnonzero(few.ravel()[index]), share.reshape(-1, 1)[index]
+
+    def _render_together(self, hits: Hits, leds: Sequence[str]) -> dict[str, LedImage]:
+        """The images of alike LEDs: rays, shadows and shading of all of them at once."""
+        parts = [self.scene.leds[name] for name in leds]
+        group = Group(parts, hits.sample, hits.valid.size)
+        group.visible = self._unshaded_together(hits, group)
+        seen = self._seen(group.visible).reshape(-1, len(parts), *hits.shape)
+        rims = self._rim(hits, seen)
+        indices, few, shares = zip(*(self._sampled(hits, part, rim) for part, rim in zip(parts, rims)))
+        few = [np.isin(np.arange(len(index)), bent) for index, bent in zip(indices, few)]
+        finer = group.split(self._in_pixels(np.concatenate(indices), np.concatenate(few)), list(map(len, indices)))
+        if group.finer is not None:
+            group.rim_visible = self._visible(group.finer.si, group.at_finer())
+        raw = self._raw_together(
+            group,
+            lambda: self._shade(group.centres(), group.at_centres(), group.visible),
+            lambda: self._shade(group.finer, group.at_finer(), group.rim_visible),
+        )
+        found = {}
+        for k, name in enumerate(leds):
+            lit = seen[:, k].mean(0) > 0.5
+            image = found[name] = LedImage(name, hits, rims[k], indices[k], finer[k], None, None, lit, group)
+            image.share, image.raw = shares[k], raw[k]
             image.radiance = self._mix(image, image.raw)
-        return image
+        return found
+
+    def _raw_together(self, group: Group, centre: Callable, rim: Callable) -> list[tuple]:
+        """`_raw` of each LED of a group."""
+        (centres,) = self._bands([centre()])
+        fine = self._bands([rim()])[0] if group.finer is not None else None
+        return group.apart(centres, fine)
+
+    def _unshaded_together(self, hits: Hits, group: Group):
+        """`_unshaded` of several LEDs."""
+        key = tuple((part.name, *part.held.values()) for part in group.lights)
+        if hits.lit.get("", ((), None))[0] != key:
+            hits.lit[""] = key, self._visible(group.centres().si, group.at_centres())
+        return hits.lit[""][1]
 
     def _render_crowded(self, hits: Hits, led: str, seed: int) -> LedImage:
         """The image of one LED in a crowded scene: finer samples in all pixels, few where no outline is."""
@@ -538,19 +609,22 @@ class Renderer:
             return image.rim, image.lit
         self.apply(values)
         visible = self._unshaded(image.hits, self.scene.leds[led])
-        return self._rim(image.hits, visible), self._seen(visible).mean(0) > 0.5
+        seen = self._seen(visible)
+        return self._rim(image.hits, seen), seen.mean(0) > 0.5
 
     def _seen(self, visible) -> np.ndarray:
         """(points of the source, H, W)"""
         return np.array(visible).reshape(-1, self.height, self.width)
 
-    def _rim(self, hits: Hits, visible) -> np.ndarray:
-        return np.logical_or.reduce([_edges(s & hits.valid) for s in self._seen(visible)]) | hits.edges
+    def _rim(self, hits: Hits, seen: np.ndarray) -> np.ndarray:
+        """(..., H, W) pixels at a rim of the geometry, or of the shadow of a point of a source, of sources that reach
+        (points, ..., H, W)."""
+        return edges(seen & hits.valid).any(0) | hits.edges
 
     def _joint_rim(self, hits: Hits) -> np.ndarray:
         """Pixels at a rim for any light: in scenes with layers one set of finer samples serves all."""
         if hits.joint is None:
-            rims = (self._rim(hits, self._unshaded(hits, part)) for part in self.scene.leds.values())
+            rims = (self._rim(hits, self._seen(self._unshaded(hits, part))) for part in self.scene.leds.values())
             hits.joint = np.logical_or.reduce([hits.edges, *rims])
         return hits.joint
 
@@ -937,7 +1011,17 @@ class Renderer:
             own = self.led_keys[led]
             others = [k for k in own if k in self.asked and k != key and k not in found] if key in own else []
             at_once = max(int(AT_ONCE / max(image.finer.size, image.hits.valid.size)), 1)
-            found.update(self._tangents_of(values, image, [key, *others[: at_once - 1]]))
+            keys = [key, *others[: at_once - 1]]
+            mates = self._mates(values, image, keys, seed)
+            try:
+                slopes_of = self._tangents_of(values, image, keys, mates)
+            except (Apart, BadPlugin):
+                if not mates:
+                    raise
+                self.apart = True
+                slopes_of = self._tangents_of(values, image, keys)
+            for mate, slopes in slopes_of.items():
+                self._slopes.setdefault((mate.led, id(mate)), (mate, {}))[1].update(slopes)
             if not self.asked:
                 self._slopes.clear()
         if component and not self.layered:
@@ -965,19 +1049,55 @@ class Renderer:
         part = self.scene.parts[name]
         return name == _board(lamp) or (part is lamp and part.numbers[parameter].role in MOVES)
 
-    def _tangents_of(self, values: Mapping, image: LedImage, keys: Sequence[str]) -> dict[str, tuple]:
-        """key -> `_raw` of the derivative of an LED's image."""
+    def _mates(self, values: Mapping, image: LedImage, keys: Sequence[str], seed: int) -> list[LedImage]:
+        """The images whose tangents are made with those of an LED's image: of all LEDs that it was made with, where
+        they are lit as well and will be asked for the same; [] for none."""
+        group, lit = image.group, self.lit(values)
+        if self.apart or group is None or not all(name in lit for name in group.names):
+            return []
+        wanted = [self._of(key, image.led, name) for key in keys for name in group.names]
+        found = [self._images.get(self._image_key(values, name, seed)) for name in group.names]
+        alike = all(mate is not None and mate.group is group for mate in found)
+        return found if alike and self.asked.issuperset(wanted) else []
+
+    def _of(self, key: str, led: str, other: str) -> str:
+        """The key of an LED's own parameter, of another LED; any other key as it is."""
+        return f"{other}.{key.rsplit('.', 1)[1]}" if key.rsplit(".", 1)[0] == led else key
+
+    def _tangents_of(
+        self, values: Mapping, image: LedImage, keys: Sequence[str], mates: Sequence[LedImage] = ()
+    ) -> dict[LedImage, dict[str, tuple]]:
+        """Image -> key -> `_raw` of the derivative of an LED's image; of several that were made together, each by its
+        own LED's parameters."""
         import drjit as dr
         import mitsuba as mi
 
-        lamp = self.scene.leds[image.led]
-        moving = [k for k in keys if self._moves(k, lamp) and len(image.index)]
+        lamp, group = self.scene.leds[image.led], image.group if mates else None
+        sampled = len(image.index) if group is None else group.finer is not None
+        moving = [k for k in keys if self._moves(k, lamp) and sampled]
         self.apply(values, move=bool(moving))
         places = {k: (self.scene.parts[k.rsplit(".", 1)[0]], k.rsplit(".", 1)[1]) for k in keys}
+        own = {k: name for k, (part, name) in places.items() if group is not None and part is lamp}
 
-        def tangents(sample, visible, own):
-            before = {k: getattr(*places[k]) for k in own}
-            attached = {k: mi.Float(dr.detach(value)) for k, value in before.items()}
+        def value_of(key):
+            """Of several LEDs, one value for each."""
+            return group.numbers(own[key]) if key in own else getattr(*places[key])
+
+        @contextmanager
+        def put(numbers):
+            """Within it parts hold other numbers; gives those that are the LEDs' own."""
+            before = {k: getattr(*places[k]) for k in numbers if k not in own}
+            for k in before:
+                setattr(*places[k], numbers[k])
+            try:
+                yield {own[k]: number for k, number in numbers.items() if k in own}
+            finally:
+                for k, number in before.items():
+                    setattr(*places[k], number)
+
+        def tangents(of, visible, asked):
+            sample, lights = of()
+            attached = {k: mi.Float(dr.detach(value_of(k))) for k in asked}
 
             def take(light):
                 found = []
@@ -988,42 +1108,47 @@ class Renderer:
                     dr.clear_grad(light)
                 return found
 
-            for k, value in attached.items():
-                dr.enable_grad(value)
-                setattr(*places[k], value)
-            try:
-                return self._shade_each(sample, lamp, visible, take)
-            finally:
-                for k, value in before.items():
-                    setattr(*places[k], value)
+            dr.enable_grad(*attached.values())
+            with put(attached) as given:
+                return self._shade_each(sample, lights(given), visible, take)
 
-        def moved(key):
-            part, parameter = places[key]
-            value, number = getattr(part, parameter), part.numbers[parameter]
-            step = number.step * number.plausible
-            sides = []
+        def moved(key, of):
+            number = self.scene.parameters[key]
+            step, sides = number.step * number.plausible, []
             for sign in (1, -1):
-                setattr(part, parameter, dr.opaque(mi.Float, float(value[0]) + sign * step))
-                try:
-                    sample = image.finer.sample
-                    sides.append(self._shade(sample, lamp, self._visible(sample.si, lamp)))
-                finally:
-                    setattr(part, parameter, value)
+                with put({key: dr.opaque(mi.Float, 0.0) + value_of(key) + sign * step}) as given:
+                    sample, lights = of()
+                    sides.append(self._shade(sample, lights(given), self._visible(sample.si, lights(given))))
             return (sides[0] - sides[1]) / (2 * step)
 
-        def rims():
+        def rims(of, visible):
             still = [k for k in keys if k not in moving]
-            found = dict(zip(still, tangents(image.finer.sample, image.rim_visible, still))) if still else {}
-            return [found[k] if k in found else moved(k) for k in keys]
+            found = dict(zip(still, tangents(of, visible, still))) if still else {}
+            return [found[k] if k in found else moved(k, of) for k in keys]
 
-        centres: Iterable[np.ndarray] = repeat(np.zeros((self.height * self.width, self.bands)))
+        if group is None:
+            middle, middle_seen, rays = (
+                (lambda: (image.hits.sample, lambda given: lamp)),
+                image.visible,
+                image.finer.size,
+            )
+            fine, fine_seen = (lambda: (image.finer.sample, lambda given: lamp)), image.rim_visible
+        else:
+            middle, middle_seen, rays = (lambda: (group.centres(), group.at_centres)), group.visible, sum(group.sizes)
+            fine, fine_seen = (lambda: (group.finer, group.at_finer)), group.rim_visible
+        pixels = self.height * self.width * max(len(mates), 1)
+        centres: Iterable[np.ndarray] = repeat(np.zeros((pixels, self.bands)))
         if not self.crowded:
-            made = self._each_band_of(lambda: tangents(image.hits.sample, image.visible, keys), image.led)
-            centres = [np.broadcast_to(m, (self.height * self.width, self.bands)) for m in made]
-        fine: Iterable[np.ndarray | None] = repeat(None)
-        if len(image.index):
-            fine = [np.broadcast_to(m, (image.finer.size, self.bands)) for m in self._each_band_of(rims, image.led)]
-        return dict(zip(keys, zip(centres, fine)))
+            made = self._each_band_of(lambda: tangents(middle, middle_seen, keys), image.led)
+            centres = [np.broadcast_to(m, (pixels, self.bands)) for m in made]
+        finely: Iterable[np.ndarray | None] = repeat(None)
+        if sampled:
+            made = self._each_band_of(lambda: rims(fine, fine_seen), image.led)
+            finely = [np.broadcast_to(m, (rays, self.bands)) for m in made]
+        if group is None:
+            return {image: dict(zip(keys, zip(centres, finely)))}
+        each = zip(*(group.apart(c, f) for c, f in zip(centres, finely)))
+        return {m: {self._of(k, image.led, m.led): r for k, r in zip(keys, raw)} for m, raw in zip(mates, each)}
 
     def bounced(
         self, values: Mapping, led: str, seed: int = 0, component: int = 0, roughly: bool = False
@@ -1167,100 +1292,6 @@ class Directions:
         return mi.Point2f(next(self._numbers), next(self._numbers))
 
 
-class Sample(NamedTuple):
-    """Camera rays at their ends (Dr.Jit), and in a scene with layers the paths that they took."""
-
-    si: object
-    weight: object
-    origin: object
-    path: paths.Path | None = None
-
-
-class Hits:
-    """Primary hits of one geometry: si, weight, origin (Dr.Jit), and what they show as numpy images."""
-
-    def __init__(self, sample: Sample, height: int, width: int):
-        self.sample = sample
-        self.si, self.weight, self.origin, self.path = sample
-        self.shape = (height, width)
-        self.rims: dict = {}
-        self.joint: np.ndarray | None = None
-        self.lit: dict[str, tuple] = {}  # what lights see of the pixels' centres, by what it was found for
-        self.eye = np.zeros(3)  # where the camera stood
-        self.valid = np.array(self.si.is_valid()).reshape(height, width)
-        self.edges = _edges(self.valid)
-        if self.path is not None:  # what is passed, and what is met, changes at an edge
-            for met in (self.path.shape, *self.path.regions, *(step.part for step in self.path.steps)):
-                self.edges |= _edges(met.reshape(height, width))
-            self.edges |= _creases(np.where(self.valid[..., None], self.normal, 0.0))
-        self.bent = (
-            np.zeros((height, width))
-            if self.path is not None
-            else _bent(np.where(self.valid[..., None], self.normal, 0.0))
-        )
-
-    def image(self, values) -> np.ndarray:
-        return np.array(values).reshape(self.shape)
-
-    @property
-    def position(self) -> np.ndarray:
-        return np.array(self.si.p).T.reshape(*self.shape, 3)
-
-    @property
-    def normal(self) -> np.ndarray:
-        return np.array(self.si.sh_frame.n).T.reshape(*self.shape, 3)
-
-
-class Finer:
-    """Finer samples of some pixels, those of a pixel behind each other.
-
-    counts   (n,) of each pixel;   sample   their ends, N in all; None where no pixel has any;   at   their places u, v
-             in px, (N,) each
-    """
-
-    def __init__(self, counts: np.ndarray, sample: Sample | None, at: tuple[np.ndarray, np.ndarray]):
-        self.counts, self.sample, self.at = counts, sample, at
-        self.size = int(counts.sum())
-        self._starts = np.cumsum(counts) - counts
-        self._sorted: dict = {}  # side -> which samples lie in which part of a pixel, as weights of their mean
-
-    def mean(self, values: np.ndarray) -> np.ndarray:
-        """(n, B) mean in each pixel of values (N, B)."""
-        return np.add.reduceat(values, self._starts) / self.counts[:, None]
-
-    def in_parts(self, values: np.ndarray, side: int, index: np.ndarray, width: int) -> np.ndarray:
-        """(n, side^2, B) mean of values (N, B) in each part of the pixels `index`, row by row; in a part without a
-        sample the pixel's mean."""
-        from scipy.sparse import coo_array
-
-        if side not in self._sorted:
-            pixel = np.repeat(np.arange(len(self.counts)), self.counts)
-            corner = (index % width)[pixel], (index // width)[pixel]
-            column, row = (np.clip(((a - c) * side).astype(int), 0, side - 1) for a, c in zip(self.at, corner))
-            part = pixel * side**2 + row * side + column
-            count = np.bincount(part, minlength=len(self.counts) * side**2)
-            weights = coo_array((1 / count[part], (part, np.arange(self.size))), (len(count), self.size)).tocsr()
-            self._sorted[side] = weights, count.reshape(-1, side**2, 1) == 0
-        weights, empty = self._sorted[side]
-        found = (weights @ values).reshape(len(self.counts), side**2, -1)
-        return np.where(empty, self.mean(values)[:, None], found) if empty.any() else found
-
-    def span(self, values: np.ndarray) -> np.ndarray:
-        """(n, B) largest less smallest of values (N, B) in each pixel."""
-        return np.maximum.reduceat(values, self._starts) - np.minimum.reduceat(values, self._starts)
-
-
-class LedImage:
-    """One LED's image with the hits, rim pixels and shadows that it was made from."""
-
-    def __init__(self, led, hits, rim, index, finer, visible, rim_visible, lit):
-        self.led, self.hits, self.rim, self.index, self.finer = led, hits, rim, index, finer
-        self.visible, self.rim_visible, self.lit = visible, rim_visible, lit
-        self.share: np.ndarray | float = 1.0  # (n, 1) of the finer samples in each of those pixels
-        self.raw: tuple | None = None  # what the light makes before layers: at centres, at finer samples
-        self.radiance: np.ndarray | None = None  # the image, in scenes without layers
-
-
 def _power_of_two(number: float) -> int:
     """The next one: as many points of a Sobol sequence are even in every half."""
     return 1 << math.ceil(math.log2(number))
@@ -1295,46 +1326,3 @@ def _reversed(count: int) -> np.ndarray:
     """(n,) the second coordinates of a Hammersley set: the bits of a number, behind the point in reverse."""
     k = np.arange(count)
     return sum(((k >> b) & 1) / 2 ** (b + 1) for b in range(count.bit_length() - 1))
-
-
-def _creases(normal: np.ndarray) -> np.ndarray:
-    """Pixels on either side of a sharp edge of a body: normals (H, W, 3) that turn by more than CREASE from one to the
-    next."""
-    found = np.zeros(normal.shape[:2], bool)
-    for axis in (0, 1):
-        near, far = (np.take(normal, range(k, normal.shape[axis] - 1 + k), axis) for k in (0, 1))
-        turned = (near * far).sum(-1) < np.cos(np.radians(CREASE)) * np.linalg.norm(near, axis=-1) * np.linalg.norm(
-            far, axis=-1
-        )
-        first, second = ((slice(None),) * axis + (slice(k, normal.shape[axis] - 1 + k),) for k in (0, 1))
-        found[first] |= turned
-        found[second] |= turned
-    return found
-
-
-def _bent(normal: np.ndarray) -> np.ndarray:
-    """(H, W) share, 0 to 1, by which finer samples stand for a pixel and not its middle.
-
-    The mean over a pixel of what varies is its middle and a twenty-fourth of its second differences. Where these are,
-    for the normals (H, W, 3), above 24 BENT, the share is 1, and it fades to 0 at half of that: an image has no steps
-    when a dent moves."""
-    found = np.zeros(normal.shape[:2])
-    for axis in (0, 1):
-        if normal.shape[axis] < 3:
-            continue
-        inner = (slice(None),) * axis + (slice(1, -1),)
-        found[inner] = np.maximum(found[inner], np.linalg.norm(np.diff(normal, 2, axis=axis), axis=-1) / 24)
-    return np.clip(2 * found / BENT - 1, 0.0, 1.0)
-
-
-def _edges(mask: np.ndarray) -> np.ndarray:
-    """Pixels whose neighbourhood (3 x 3) is not all of one kind."""
-    low, high = _around(mask)
-    return low != high
-
-
-def _around(plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Smallest and largest value in the neighbourhood (3 x 3) of each pixel."""
-    from scipy.ndimage import maximum_filter, minimum_filter
-
-    return minimum_filter(plane, 3), maximum_filter(plane, 3)

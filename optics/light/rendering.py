@@ -38,7 +38,8 @@ from optics.light import paths
 from optics.light.development import Developer
 from optics.light.labels import Labels
 from optics.light.monte_carlo import renderer_of
-from optics.light.renderer import Hits, Renderer, Sample
+from optics.light.renderer import Renderer
+from optics.light.samples import Hits, Sample
 from optics.scene.integral import FEW
 from optics.scene.loader import Scene
 from optics.scene.mitsuba_parts import is_part

@@ -1,0 +1,126 @@
+"""Images of LEDs over one geometry that are made at once are those that are made one by one, derivatives too."""
+
+import numpy as np
+import pytest
+
+from optics.light.renderer import Renderer
+from optics.light.together import Apart, Together, alike
+from optics.scene import loader
+
+SMALL = {"width": "32", "height": "24"}
+
+
+def pressed(name):
+    """(scene, values with a dent, and with every effect of its LEDs)."""
+    scene = loader.load(name, SMALL)
+    values = {**scene.values(), f"{scene.gel.name}.press_depth": 0.5, f"{scene.gel.name}.press_x": 0.7}
+    values |= dict.fromkeys(scene.powers.values(), 1.0)
+    for key, p in scene.parameters.items():
+        if key.split(".")[0] in scene.leds and p.how == "ad" and values[key] == p.neutral:
+            values[key] = float(np.clip(p.neutral + 0.3 * p.plausible, *p.bounds))
+    return scene, values
+
+
+SCENES = ["digit", *(pytest.param(n, marks=pytest.mark.slow) for n in ("gelsight", "gelsight_bench", "gelsight_mini"))]
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_images(mitsuba, name):
+    """Pixels' centres, rims of shadows and what bends; LEDs of different classes and boards apart."""
+    scene, values = pressed(name)
+    values |= {k: 2.0 for k, p in scene.parameters.items() if p.role == "light area"}
+    one_by_one, at_once = Renderer(scene), Renderer(scene)
+    at_once.together = set(scene.leds)
+    at_once_made = 0
+    for led in scene.leds:
+        expected, found = one_by_one.led(values, led), at_once.led(values, led)
+        at_once_made += found.group is not None
+        largest = expected.radiance.max()
+        assert largest > 0 and np.abs(found.radiance - expected.radiance).max() < 1e-5 * largest
+        assert (found.rim == expected.rim).all() and (found.index == expected.index).all()
+        assert (np.array(found.visible) == np.array(expected.visible)).all()
+    assert at_once_made >= 2 and not at_once.apart
+
+
+@pytest.mark.parametrize("name", ["digit", pytest.param("gelsight_bench", marks=pytest.mark.slow)])
+def test_derivatives(mitsuba, name):
+    """By what each LED has for itself, by a board that all stand on, and by what the surface holds."""
+    scene, values = pressed(name)
+    one_by_one, at_once = Renderer(scene), Renderer(scene)
+    at_once.together = set(scene.leds)
+    leds = list(scene.leds)[:3]
+    own = sorted({k.split(".")[1] for k in one_by_one.led_keys[leds[0]] if k.startswith(f"{leds[0]}.")})
+    own = [k for k in own if scene.parameters[f"{leds[0]}.{k}"].how == "ad"]
+    boards = [f"{b}.{n}" for b in scene.boards for n in ("x", "rz")]
+    surface = [k for k in one_by_one.shading_keys if scene.parameters[k].how == "ad"][:3]
+    assert len(own) > 4 and surface and (boards or name != "gelsight_bench")
+    shared = [*boards, *surface]
+    asked = [f"{led}.{k}" for led in scene.leds for k in own]
+    with at_once.asking([*asked, *shared]):
+        for led in leds:
+            for key in [*(f"{led}.{k}" for k in own), *shared]:
+                expected, found = (r.led_tangent(values, led, key) for r in (one_by_one, at_once))
+                # single precision, summed in another order
+                assert np.allclose(found, expected, rtol=1e-4, atol=2e-5 * max(np.abs(expected).max(), 1e-12)), key
+        assert len(at_once._slopes) == len(scene.leds)  # all were made with the first
+    assert any(np.abs(one_by_one.led_tangent(values, leds[0], k)).max() > 0 for k in surface)
+
+
+def test_what_is_not_alike(mitsuba):
+    """Words, points and sides of a window set LEDs apart; what one of them alone can answer is refused."""
+    scene = loader.load("digit", SMALL)
+    lights = list(scene.leds.values())
+    assert [len(own) for own in alike(lights, [])] == [len(lights)]
+    lights[0].hold("area", 1.0)
+    assert sorted(len(own) for own in alike(lights, [])) == [1, len(lights) - 1]
+    lights[0].hold("area", 0.0)
+    lights[0].hold("z", lights[1].number("z") + 2.0)
+    assert len(alike(lights, [lights[1].number("z") + 1.0])) == 2
+    import mitsuba as mi
+
+    both = Together(lights[:2], mi.UInt32([0, 1, 1]))
+    assert np.allclose(np.array(both.x), [lights[k].number("x") for k in (0, 1, 1)])
+    assert np.allclose(np.array(both.axis()).T[1], np.array(lights[1].axis()).ravel(), atol=1e-6)
+    for ask in (lambda: both.number("x"), lambda: both.held, lambda: both.unheard_of):
+        with pytest.raises(Apart):
+            ask()
+
+
+def test_effects_that_ask_one_led(mitsuba, tmp_path):
+    """An effect of one's own may ask its LED for a Python number: then images are made one by one."""
+    (tmp_path / "near.py").write_text(
+        '''"""Near: light falls with the LED's height.
+
+Definition
+    x
+"""
+from optics.scene.declare import Effect
+from optics.scene.parameter import Parameter
+
+
+def act(beam, led):
+    return 1 + led.near * abs(led.number("z"))
+
+
+effect = Effect(
+    name="nearness",
+    part="led",
+    stages={"emission": act},
+    parameters=(Parameter("near", "1/mm", 0.0, (-1.0, 1.0), "strength", neutral=0.0, plausible=0.1),),
+    acts=("led",),
+)
+'''
+    )
+    scene = loader.load("digit", SMALL, plugins=tmp_path)
+    values = {**scene.values(), **{f"{led}.near": 0.1 for led in scene.leds}}
+    one_by_one, at_once, at_rest = Renderer(scene), Renderer(scene), Renderer(scene)
+    at_once.together = at_rest.together = set(scene.leds)
+    for led in scene.leds:
+        assert (at_once.led(values, led).radiance == one_by_one.led(values, led).radiance).all()
+    assert at_once.apart
+    still = scene.values()  # the effect is asked only for its derivative
+    with at_rest.asking([f"{led}.near" for led in scene.leds]):
+        for led in scene.leds:
+            expected = one_by_one.led_tangent(still, led, f"{led}.near")
+            assert np.allclose(at_rest.led_tangent(still, led, f"{led}.near"), expected, rtol=1e-5)
+    assert at_rest.apart and expected.max() > 0
