@@ -694,9 +694,17 @@ class SceneModel:
         return (second - first) / (high - low)
 
     def _difference_led(self, now: Mapping, led: str, key: str, component: int, seed: int = 0) -> np.ndarray:
-        low, high = self.parameters[key].sides(now[key])
+        """Central difference of one LED's image by a parameter of its own. The same of others, which do not show in it,
+        are moved as well where their images are asked for too: all are made at once."""
+        number = key.rpartition(".")[2]
+        mates = {f"{other}.{number}" for other in self.renderer.together} & self.renderer.asked
+        sides = {k: self.parameters[k].sides(now[k]) for k in {key} | mates}
         with self.renderer.in_passing():
-            first, second = (self.renderer.image({**now, key: value}, led, component, seed) for value in (low, high))
+            first, second = (
+                self.renderer.image({**now, **{k: ends[n] for k, ends in sides.items()}}, led, component, seed)
+                for n in (0, 1)
+            )
+        low, high = sides[key]
         return (second - first) / (high - low)
 
     def _difference_ambient(self, now: Mapping, key: str, component: int) -> np.ndarray:
@@ -889,7 +897,10 @@ def _differentiated(
         for v in own
         if v.name not in secant
         for k in model._acts(values, v, index)
-        if model.parameters[k].how == "ad" and not model._is_power(k)
+        if model.parameters[k].how == "ad"
+        and not model._is_power(k)
+        or model.parameters[k].how == "difference"
+        and k.rpartition(".")[0] in model.scene.leds
     }
     model.renderer.rough = model.sampled and seed != 0
     try:

@@ -144,6 +144,7 @@ class Renderer:
         self._recent: list[paths.Path] = []
         self._hits: OrderedDict = OrderedDict()
         self._second: tuple[tuple, tuple] | None = None  # what second directions meet, and of which values
+        self._drawn: OrderedDict[tuple, tuple] = OrderedDict()  # places and numbers of these directions
         self._glow: tuple[tuple, LedImage] | None = None  # the image of light that no LED made, and of which values
         self._images: OrderedDict[tuple, LedImage] = OrderedDict()
         self._plain: OrderedDict[tuple, np.ndarray] = OrderedDict()  # of differences, which need nothing else
@@ -184,7 +185,7 @@ class Renderer:
         self._kept_rays = 0.0  # camera rays that are kept, at most
         self.memory = MEMORY  # bytes; less of it where several processes share the frames
         self.together: set[str] = set()  # LEDs whose images are wanted of the same geometry
-        self.asked: set[str] = set()  # parameters whose tangents will be asked for, see `asking`
+        self.asked: set[str] = set()  # parameters whose derivatives will be asked for, see `asking`
         self._slopes: dict[tuple, tuple[LedImage, dict[str, tuple]]] = {}  # those that were made with others
         self.wanted: Pixels | None = None  # those that take finer samples where they need them; None: all
         self.apart = False  # whether something of the scene must be asked of each LED by itself
@@ -1009,7 +1010,8 @@ class Renderer:
         if key not in found:
             # what a surface holds enters by a call of its own, which a graph that is gone through again cannot follow
             own = self.led_keys[led]
-            others = [k for k in own if k in self.asked and k != key and k not in found] if key in own else []
+            asked = [k for k in own if k in self.asked and self.scene.parameters[k].how == "ad"] if key in own else []
+            others = [k for k in asked if k != key and k not in found]
             at_once = max(int(AT_ONCE / max(image.finer.size, image.hits.valid.size)), 1)
             keys = [key, *others[: at_once - 1]]
             mates = self._mates(values, image, keys, seed)
@@ -1209,20 +1211,31 @@ class Renderer:
     def _spread_rays(self, seed: int, samples: int) -> tuple[Sample, list]:
         """(ends of the camera rays that gather light from all around, the numbers that their second directions are
         drawn by, in Dr.Jit arrays): the same for every geometry and LED."""
+        cell = self.bounce[0]
+        at, numbers = self._directions(seed, samples)
+        sample = self._trace(*(np.minimum(a * cell, size - 1e-3) for a, size in zip(at, (self.width, self.height))))
+        return sample, numbers
+
+    def _directions(self, seed: int, samples: int) -> tuple[list[np.ndarray], list]:
+        """(u, v in cells of where these rays pass, Dr.Jit arrays of the numbers of their second directions); those of
+        images and of rough ones are kept."""
         import mitsuba as mi
         from scipy.stats import qmc
 
-        cell = self.bounce[0]
-        rows, columns = -(-self.height // cell), -(-self.width // cell)
-        rng = np.random.default_rng([seed, 77])
-        drawn, shifts = (
-            qmc.Sobol(BOUNCE_NUMBERS, rng=rng).random(_power_of_two(n))[:n] for n in (samples, rows * columns)
-        )
-        numbers = ((drawn + shifts[:, None]) % 1).reshape(-1, BOUNCE_NUMBERS)
-        v, u = (np.repeat(a.ravel(), samples) for a in np.mgrid[:rows, :columns])
-        at = [a + numbers[:, k] for k, a in enumerate((u, v))]
-        sample = self._trace(*(np.minimum(a * cell, size - 1e-3) for a, size in zip(at, (self.width, self.height))))
-        return sample, [mi.Float(column) for column in np.ascontiguousarray(numbers[:, 2:].T, np.float32)]
+        key = (seed, samples, *self.bounce)
+        if key not in self._drawn:
+            while len(self._drawn) > 1:
+                self._drawn.popitem(last=False)
+            rows, columns = (-(-size // self.bounce[0]) for size in (self.height, self.width))
+            rng = np.random.default_rng([seed, 77])
+            drawn, shifts = (
+                qmc.Sobol(BOUNCE_NUMBERS, rng=rng).random(_power_of_two(n))[:n] for n in (samples, rows * columns)
+            )
+            numbers = ((drawn + shifts[:, None]) % 1).reshape(-1, BOUNCE_NUMBERS)
+            v, u = (np.repeat(a.ravel(), samples) for a in np.mgrid[:rows, :columns])
+            at = [a + numbers[:, k] for k, a in enumerate((u, v))]
+            self._drawn[key] = at, [mi.Float(c) for c in np.ascontiguousarray(numbers[:, 2:].T, np.float32)]
+        return self._drawn[key]
 
     def _bounced(self, values: Mapping, led: str, image: np.ndarray, component: int) -> np.ndarray:
         """A bounced image behind the layers."""
