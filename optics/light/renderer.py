@@ -1,7 +1,8 @@
 """Prediction: what a scene says that a capture set should look like, frame by frame, and how that changes.
 
 Light is linear in every LED, so each LED is rendered once per geometry at power 1 and kept; powers, exposure, colour
-and response act on the kept images. One sample per pixel does away from edges, at its middle; in scenes without layers
+and response act on the kept images. Of small images, LEDs over one geometry are rendered at once
+(`optics.light.together`). One sample per pixel does away from edges, at its middle; in scenes without layers
 a 24th of the second differences from pixel to pixel leads from there to the mean of the pixel
 (`optics.scene.images.bend`; next to an LED of `gelsight` with pixels of 0.5 mm the two differ by 0.5 %, on `digit` by
 0.1 %). Pixels at the rim of a shadow or of the gel are sampled 128 times; where the face bends, and in the penumbra of
