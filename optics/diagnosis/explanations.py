@@ -883,6 +883,7 @@ def _survived(case: Case, outcome: Outcome) -> Outcome:
         told = {id(t) for t in outcome.trials for j in judges if t is not j and _told(case, outcome, j, t)}
         alive = [best] + [t for t in outcome.trials if t is not best and id(t) not in told]
         alive += [t for t in _inherited(case, outcome, alive) if t not in alive]
+        alive = [t for t in alive if t is best or not _says_nothing(t, base)]
         outcome.shared |= able and base in alive
         # noise is a rival that is no explanation by effects; what is clearly not worth its cost beside it, or explains
         # no more than chance does, is that noise under another name
@@ -907,6 +908,12 @@ def _survived(case: Case, outcome: Outcome) -> Outcome:
             break
         outcome.shared |= able and lead <= needed and not rival.members
     return outcome
+
+
+def _says_nothing(trial: Trial, base: Trial) -> bool:
+    """Whether a refit ended where the base is: an effect that its derivative images promised much, and that no step
+    from neutral brought anything."""
+    return bool(trial.members) and trial.fall < ALIKE and _distance(trial, base) < ALIKE
 
 
 def _adds_to_noise(trial: Trial, base: Trial) -> bool:
