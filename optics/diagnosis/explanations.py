@@ -366,7 +366,7 @@ def _within(case: Case, trials: dict[frozenset[str], Trial], fits: dict[str, Fit
 
 
 def _without_one(case: Case, trials: dict[frozenset[str], Trial], fits: dict[str, Fit]) -> bool:
-    """One round of that; whether any refit explains more than was known."""
+    """One round of that; whether any refit clearly explains more than was known."""
     scale, any_improved = _scale(case, trials.values()), False
     for t in sorted(trials.values(), key=lambda t: -_score(t, scale))[:LEADERS]:
         for c in t.members if len(t.members) > 1 else []:
@@ -381,8 +381,10 @@ def _without_one(case: Case, trials: dict[frozenset[str], Trial], fits: dict[str
             for v, at in zip(c.variables, c.start):
                 start.put(v, float(at))
             if _improved(case, trials, fits, rest, start):
-                any_improved = True
-                if len(rest) == 1:
+                found = trials[names].fall
+                any_improved |= found > reached + CLEAR * scale
+                # as hidden as this one, they explain about as much: by far less than the best, they are no rivals of it
+                if len(rest) == 1 and found > TRUSTED * max(o.fall for o in trials.values()):
                     _rivals(case, trials, fits, rest[0])
     return any_improved
 
