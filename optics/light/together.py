@@ -190,10 +190,7 @@ class Group:
 
     def _fine(self, k: int):
         """Lanes of the finer samples of a light."""
-        import drjit as dr
-        import mitsuba as mi
-
-        return sum(self.sizes[:k]) + dr.arange(mi.UInt32, self.sizes[k])
+        return _lanes(sum(self.sizes[:k]), self.sizes[k])
 
     def apart(self, centres: np.ndarray, fine: np.ndarray | None) -> list[tuple]:
         """(values at the pixels' centres, at the finer samples or None) of each light, from those of all lanes."""
@@ -203,15 +200,20 @@ class Group:
 
     def visible_to(self, name: str):
         """`visible` of one light."""
-        import drjit as dr
-        import mitsuba as mi
-
-        return gathered(self.visible, self.names.index(name) * self.pixels + dr.arange(mi.UInt32, self.pixels))
+        return gathered(self.visible, _lanes(self.names.index(name) * self.pixels, self.pixels))
 
     def finely_visible_to(self, name: str):
         """`rim_visible` of one light."""
         k = self.names.index(name)
         return gathered(self.rim_visible, self._fine(k)) if self.sizes[k] else None
+
+
+def _lanes(first: int, count: int):
+    """Lanes behind each other; the first is opaque: as a literal it would be compiled into a kernel of its own."""
+    import drjit as dr
+    import mitsuba as mi
+
+    return dr.opaque(mi.UInt32, first) + dr.arange(mi.UInt32, count)
 
 
 def gathered(tree, lanes):
