@@ -124,3 +124,33 @@ effect = Effect(
             expected = one_by_one.led_tangent(still, led, f"{led}.near")
             assert np.allclose(at_rest.led_tangent(still, led, f"{led}.near"), expected, rtol=1e-5)
     assert at_rest.apart and expected.max() > 0
+
+
+def test_another_press_needs_no_other_kernel(mitsuba):
+    """What differs from press to press, such as how many finer samples an LED takes, is no part of compiled code: a
+    calibration of six LEDs that are lit one at a time took twice as long."""
+    import drjit as dr
+
+    scene, values = pressed("digit")
+    renderer = Renderer(scene)
+    renderer.together = set(scene.leds)
+    *others, last = scene.leds
+
+    def press(x):
+        """An image of all LEDs, derivatives of all, then of one that is lit alone."""
+        now = {**values, f"{scene.gel.name}.press_x": x}
+        alone = {**now, **{scene.powers[led]: 0.0 for led in others}}
+        keys = [f"{led}.{name}" for led in scene.leds for name in ("x", "mu")]
+        for state, asked in ((now, keys), (alone, [f"{last}.x", f"{last}.mu"])):
+            with renderer.asking(asked):
+                for key in asked:
+                    renderer.led_tangent(state, key.split(".")[0], key)
+
+    for x in (0.0, 0.2, 0.4, 0.6):
+        press(x)
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        for x in (0.7, 0.8, 0.9):
+            press(x)
+        made = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
+    assert len(made) > 30 and all(k["cache_hit"] for k in made)
