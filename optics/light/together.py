@@ -12,21 +12,9 @@ import numpy as np
 
 from optics.light.samples import Finer, Sample
 
-# what a light may be asked for besides its numbers and the functions of its class: the same of all that are alike
-SHARED = (
-    "board",
-    "board_name",
-    "band",
-    "lane",
-    "curves",
-    "kind",
-    "registry",
-    "numbers",
-    "words",
-    "integral",
-    "_integral",
-    "grid",
-)
+PLAIN = (bool, int, float, str, tuple, list, type(None))  # what may be equal in all lights
+ALIKE = ("curves", "numbers", "words")  # that are told by light (`Together.spectrum`), or the same of a class
+ASKS_ONE = ("number", "numbered", "held", "hold", "reread")  # Python numbers of one light
 FRAME = "own_frame"  # three vectors that each light has for itself, for good
 _frames: WeakKeyDictionary = WeakKeyDictionary()  # light -> its frame in Python numbers
 
@@ -56,17 +44,25 @@ class Together:
         elif name == FRAME:
             axes = np.array([_frame(light) for light in self._lights], np.float32).transpose(1, 2, 0)
             value = [dr.gather(mi.Vector3f, mi.Vector3f(np.ascontiguousarray(own)), self._lane) for own in axes]
-        elif name in SHARED or name in first.words:
-            return getattr(first, name)
         else:
-            found = getattr(type(first), name, None)
-            if isinstance(found, property):
-                return found.fget(self)
-            if not callable(found) or name in ("number", "numbered", "hold", "reread"):
-                raise Apart(name)
-            return found.__get__(self)
+            return getattr(first, name) if name in ALIKE else self._shared(name)
         self.__dict__[name] = value
         return value
+
+    def _shared(self, name: str):
+        """What all lights have in common: a function or property of their class, a neighbour, a plain value."""
+        owner = next((c for c in type(self._lights[0]).__mro__ if name in vars(c)), None)
+        found = None if owner is None else vars(owner)[name]
+        if name in ASKS_ONE or (owner is not None and owner.__module__.startswith(("mitsuba", "drjit"))):
+            raise Apart(name)
+        if isinstance(found, property):
+            return found.fget(self)
+        if callable(found) and hasattr(found, "__get__"):
+            return found.__get__(self)
+        first, *others = (getattr(light, name, Apart) for light in self._lights)
+        if first is not Apart and all(o is first or (type(o) in PLAIN and o == first) for o in others):
+            return first
+        raise Apart(name)
 
     def _table(self, name: str):
         """A number of each light."""

@@ -81,9 +81,34 @@ def test_what_is_not_alike(mitsuba):
     both = Together(lights[:2], mi.UInt32([0, 1, 1]))
     assert np.allclose(np.array(both.x), [lights[k].number("x") for k in (0, 1, 1)])
     assert np.allclose(np.array(both.axis()).T[1], np.array(lights[1].axis()).ravel(), atol=1e-6)
-    for ask in (lambda: both.number("x"), lambda: both.held, lambda: both.unheard_of):
+    assert both.board is None and both.kind == "led" and both.reach() == 0
+    for ask in (
+        lambda: both.number("x"),
+        lambda: both.held,
+        lambda: both.unheard_of,
+        lambda: both.name,
+        lambda: both.id(),
+    ):
         with pytest.raises(Apart):
             ask()
+
+
+def test_rings(mitsuba):
+    """What a part holds besides its numbers, such as how many LEDs a ring has, is the same of all that are alike."""
+    scene = loader.load("particle_gel", {**SMALL, "beads": "3"})
+    rings = list(scene.leds.values())
+    assert len(rings) == 2 and len(alike(rings, [])) == (1 if rings[0].count == rings[1].count else 2)
+    import mitsuba as mi
+
+    both = Together(rings, mi.UInt32([1, 0]))
+    if rings[0].count != rings[1].count:
+        with pytest.raises(Apart):
+            both.point(mi.Point2f(0.3, 0.5))
+        rings[1].count = rings[0].count
+        both = Together(rings, mi.UInt32([1, 0]))
+    found = np.array(both.point(mi.Point2f(0.3, 0.5))).T
+    expected = [np.array(ring.point(mi.Point2f(0.3, 0.5))).ravel() for ring in reversed(rings)]
+    assert np.allclose(found, expected, atol=1e-5)
 
 
 def test_effects_that_ask_one_led(mitsuba, tmp_path):
