@@ -1119,7 +1119,9 @@ class Renderer:
             number = self.scene.parameters[key]
             step, sides = number.step * number.plausible, []
             for sign in (1, -1):
-                with put({key: dr.opaque(mi.Float, 0.0) + value_of(key) + sign * step}) as given:
+                value = mi.Float(value_of(key) + sign * step)
+                dr.make_opaque(value)
+                with put({key: value}) as given:
                     sample, lights = of()
                     sides.append(self._shade(sample, lights(given), self._visible(sample.si, lights(given))))
             return (sides[0] - sides[1]) / (2 * step)
@@ -1129,24 +1131,22 @@ class Renderer:
             found = dict(zip(still, tangents(of, visible, still))) if still else {}
             return [found[k] if k in found else moved(k, of) for k in keys]
 
-        if group is None:
-            middle, middle_seen, rays = (
-                (lambda: (image.hits.sample, lambda given: lamp)),
-                image.visible,
-                image.finer.size,
-            )
-            fine, fine_seen = (lambda: (image.finer.sample, lambda given: lamp)), image.rim_visible
-        else:
-            middle, middle_seen, rays = (lambda: (group.centres(), group.at_centres)), group.visible, sum(group.sizes)
-            fine, fine_seen = (lambda: (group.finer, group.at_finer)), group.rim_visible
+        def at_centres():
+            return (image.hits.sample, lambda given: lamp) if group is None else (group.centres(), group.at_centres)
+
+        def at_finer():
+            return (image.finer.sample, lambda given: lamp) if group is None else (group.finer, group.at_finer)
+
+        lit = image if group is None else group
         pixels = self.height * self.width * max(len(mates), 1)
+        rays = image.finer.size if group is None else sum(group.sizes)
         centres: Iterable[np.ndarray] = repeat(np.zeros((pixels, self.bands)))
         if not self.crowded:
-            made = self._each_band_of(lambda: tangents(middle, middle_seen, keys), image.led)
+            made = self._each_band_of(lambda: tangents(at_centres, lit.visible, keys), image.led)
             centres = [np.broadcast_to(m, (pixels, self.bands)) for m in made]
         finely: Iterable[np.ndarray | None] = repeat(None)
         if sampled:
-            made = self._each_band_of(lambda: rims(fine, fine_seen), image.led)
+            made = self._each_band_of(lambda: rims(at_finer, lit.rim_visible), image.led)
             finely = [np.broadcast_to(m, (rays, self.bands)) for m in made]
         if group is None:
             return {image: dict(zip(keys, zip(centres, finely)))}
