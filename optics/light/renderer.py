@@ -1013,7 +1013,10 @@ class Renderer:
             own = self.led_keys[led]
             asked = [k for k in own if k in self.asked and self.scene.parameters[k].how == "ad"] if key in own else []
             others = [k for k in asked if k != key and k not in found]
-            at_once = max(int(AT_ONCE / max(image.finer.size, image.hits.valid.size)), 1)
+            rays = [image.finer.size, image.hits.valid.size]
+            if image.group is not None:
+                rays = [sum(image.group.sizes), rays[1] * len(image.group.names)]
+            at_once = max(int(AT_ONCE / max(rays)), 1)
             keys = [key, *others[: at_once - 1]]
             mates = self._mates(values, image, keys, seed)
             try:
