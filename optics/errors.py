@@ -53,6 +53,10 @@ class BadPlugin(ValueError):
     """A plugin file whose declaration is incomplete or contradicts another one."""
 
 
+class Apart(Exception):
+    """Something was asked of several LEDs at once that only one of them can answer; never shown to a user."""
+
+
 class Untrusted(BadPlugin):
     """Code that came with data, which the user has not agreed to run."""
 

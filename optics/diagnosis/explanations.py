@@ -383,7 +383,8 @@ def _without_one(case: Case, trials: dict[frozenset[str], Trial], fits: dict[str
             if _improved(case, trials, fits, rest, start):
                 found = trials[names].fall
                 any_improved |= found > reached + CLEAR * scale
-                # as hidden as this one, they explain about as much: by far less than the best, they are no rivals of it
+                # effects that the base hides as it hid this one explain about as much as this one does; where that is
+                # far less than the best explains, they are no rivals of the best
                 if len(rest) == 1 and found > TRUSTED * max(o.fall for o in trials.values()):
                     _rivals(case, trials, fits, rest[0])
     return any_improved
@@ -913,7 +914,7 @@ def _survived(case: Case, outcome: Outcome) -> Outcome:
 
 
 def _says_nothing(trial: Trial, base: Trial) -> bool:
-    """Whether a refit ended where the base is: an effect that its derivative images promised much, and that no step
+    """Whether a refit ended where the base is. The effect's derivative images may have promised much, but no step away
     from neutral brought anything."""
     return bool(trial.members) and trial.fall < ALIKE and _distance(trial, base) < ALIKE
 

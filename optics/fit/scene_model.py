@@ -694,8 +694,8 @@ class SceneModel:
         return (second - first) / (high - low)
 
     def _difference_led(self, now: Mapping, led: str, key: str, component: int, seed: int = 0) -> np.ndarray:
-        """Central difference of one LED's image by a parameter of its own. The same of others, which do not show in it,
-        are moved as well where their images are asked for too: all are made at once."""
+        """Central difference of one LED's image by a parameter of its own. The same parameter of other LEDs, which does
+        not show in this image, is moved too where their derivatives are asked for: so all are made at once."""
         number = key.rpartition(".")[2]
         mates = {f"{other}.{number}" for other in self.renderer.together} & self.renderer.asked
         sides = {k: self.parameters[k].sides(now[k]) for k in {key} | mates}

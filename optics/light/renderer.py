@@ -23,10 +23,10 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from optics.errors import BadPlugin, BadScene
+from optics.errors import Apart, BadScene
 from optics.light import paths
 from optics.light.samples import Finer, Hits, LedImage, Sample, around, creases, edges
-from optics.light.together import Apart, Group, alike
+from optics.light.together import Group, alike
 from optics.processes import return_memory
 from optics.scene.images import bend, finer_of, from_parts, in_parts, repeated
 from optics.scene.loader import Scene
@@ -57,6 +57,7 @@ MEMORY = 2e9  # bytes of hits, with what images need for their derivatives, that
 IMAGES = 5e8  # bytes of images that are kept without them, of a renderer that remembers REMEMBER geometries
 REMEMBER = 24
 TOGETHER = 200_000  # pixels of all LEDs that are rendered at once, at most: of larger images, computing takes the time
+MOST_FINER = 1_000_000  # their finer samples, at most
 AT_ONCE = 4_000_000  # ends of camera rays times parameters whose tangents are made together
 PER_RAY = 250  # bytes of a camera ray's end and its light, by the memory of processes that held ten million of them
 BOUNCE_SAMPLES = 32  # directions per cell for the second bounce, at least
@@ -189,7 +190,8 @@ class Renderer:
         self.asked: set[str] = set()  # parameters whose derivatives will be asked for, see `asking`
         self._slopes: dict[tuple, tuple[LedImage, dict[str, tuple]]] = {}  # those that were made with others
         self.wanted: Pixels | None = None  # those that take finer samples where they need them; None: all
-        self.apart = False  # whether something of the scene must be asked of each LED by itself
+        # whether something of the scene must be asked of each LED by itself: of plugins of one's own nobody knows
+        self.apart = bool(scene.registry.own_files)
         self.side = 1  # values of a pixel each way, see `splitting`
         self.passing = self.roughly = False  # whether nothing but images is kept, see `in_passing`
 
@@ -490,7 +492,8 @@ class Renderer:
         self._plain_bytes += image.nbytes - (0 if before is None else before.nbytes)
         self._plain[key] = image
         most = IMAGES * self.remember / REMEMBER
-        while self._plain_bytes > most and len(self._plain) > 2 * len(self.scene.lights):
+        # of both sides of a difference, in pixels and in parts of these
+        while self._plain_bytes > most and len(self._plain) > 4 * len(self.scene.lights):
             self._plain_bytes -= self._plain.popitem(last=False)[1].nbytes
         return image
 
@@ -500,10 +503,12 @@ class Renderer:
         for names in self._alike(hits, leds):
             if len(names) > 1:
                 try:
-                    found.update(self._render_together(hits, names))
+                    images = self._render_together(hits, names)
+                except Apart:
+                    self.apart, images = True, {}
+                if images:
+                    found.update(images)
                     continue
-                except (Apart, BadPlugin):  # what is wrong with a plugin shows again, LED by LED
-                    self.apart = True
             found.update((name, self._render_led(hits, name, seed)) for name in names)
         return found
 
@@ -556,7 +561,8 @@ class Renderer:
         return index, np.flatnonzero(few.ravel()[index]), share.reshape(-1, 1)[index]
 
     def _render_together(self, hits: Hits, leds: Sequence[str]) -> dict[str, LedImage]:
-        """The images of alike LEDs: rays, shadows and shading of all of them at once."""
+        """The images of alike LEDs: rays, shadows and shading of all of them at once; {} where that would be too many
+        rays, as on a painted face."""
         parts = [self.scene.leds[name] for name in leds]
         group = Group(parts, hits.sample, hits.valid.size)
         group.visible = self._unshaded_together(hits, group)
@@ -564,6 +570,8 @@ class Renderer:
         rims = self._rim(hits, seen)
         indices, few, shares = zip(*(self._sampled(hits, part, rim) for part, rim in zip(parts, rims)))
         few = [np.isin(np.arange(len(index)), bent) for index, bent in zip(indices, few)]
+        if sum(np.where(own, self.bent_side**2, self.rim_samples).sum() for own in few) > MOST_FINER:
+            return {}
         finer = group.split(self._in_pixels(np.concatenate(indices), np.concatenate(few)), list(map(len, indices)))
         if group.finer is not None:
             group.rim_visible = self._visible(group.finer.si, group.at_finer())
@@ -588,7 +596,7 @@ class Renderer:
 
     def _unshaded_together(self, hits: Hits, group: Group):
         """`_unshaded` of several LEDs."""
-        key = tuple((part.name, *part.held.values()) for part in group.lights)
+        key = tuple(_standing(part) for part in group.lights)
         if hits.lit.get("", ((), None))[0] != key:
             hits.lit[""] = key, self._visible(group.centres().si, group.at_centres())
         return hits.lit[""][1]
@@ -632,7 +640,7 @@ class Renderer:
 
     def _unshaded(self, hits: Hits, part):
         """`_visible` at pixel centres, kept for as long as the light stands where it does."""
-        key = (part.name, *part.held.values())
+        key = _standing(part)
         if hits.lit.get(part.name, ((), None))[0] != key:
             hits.lit[part.name] = key, self._visible(hits.si, part)
         return hits.lit[part.name][1]
@@ -1021,9 +1029,7 @@ class Renderer:
             mates = self._mates(values, image, keys, seed)
             try:
                 slopes_of = self._tangents_of(values, image, keys, mates)
-            except (Apart, BadPlugin):
-                if not mates:
-                    raise
+            except Apart:  # of a group alone
                 self.apart = True
                 slopes_of = self._tangents_of(values, image, keys)
             for mate, slopes in slopes_of.items():
@@ -1221,8 +1227,8 @@ class Renderer:
         return sample, numbers
 
     def _directions(self, seed: int, samples: int) -> tuple[list[np.ndarray], list]:
-        """(u, v in cells of where these rays pass, Dr.Jit arrays of the numbers of their second directions); those of
-        images and of rough ones are kept."""
+        """(u, v in cells of where these rays pass, Dr.Jit arrays of the numbers of their second directions); the two
+        latest sets are kept, of images and of rough ones."""
         import mitsuba as mi
         from scipy.stats import qmc
 
@@ -1312,6 +1318,12 @@ class Directions:
 def _power_of_two(number: float) -> int:
     """The next one: as many points of a Sobol sequence are even in every half."""
     return 1 << math.ceil(math.log2(number))
+
+
+def _standing(light) -> tuple:
+    """A light's name and all numbers that it and its board have: what its shadows depend on, and more."""
+    board = getattr(light, "board", None)
+    return (light.name, *light.held.values(), *(board.held.values() if board is not None else ()))
 
 
 def _board(light) -> str:

@@ -10,17 +10,14 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from optics.errors import Apart
 from optics.light.samples import Finer, Sample
 
 PLAIN = (bool, int, float, str, tuple, list, type(None))  # what may be equal in all lights
-ALIKE = ("curves", "numbers", "words")  # that are told by light (`Together.spectrum`), or the same of a class
+ALIKE = ("numbers", "words")  # the same of a class
 ASKS_ONE = ("number", "numbered", "held", "hold", "reread")  # Python numbers of one light
 FRAME = "own_frame"  # three vectors that each light has for itself, for good
 _frames: WeakKeyDictionary = WeakKeyDictionary()  # light -> its frame in Python numbers
-
-
-class Apart(Exception):
-    """Something was asked of several lights that only one of them can answer."""
 
 
 class Together:
@@ -44,10 +41,19 @@ class Together:
         elif name == FRAME:
             axes = np.array([_frame(light) for light in self._lights], np.float32).transpose(1, 2, 0)
             value = [dr.gather(mi.Vector3f, mi.Vector3f(np.ascontiguousarray(own)), self._lane) for own in axes]
+        elif name == "curves":
+            return self._same_curves()
         else:
             return getattr(first, name) if name in ALIKE else self._shared(name)
         self.__dict__[name] = value
         return value
+
+    def _same_curves(self) -> dict:
+        """Measured spectra, where all lights have the same: what a pigment takes up asks for them. Raises Apart."""
+        first, *others = ({name: id(curve) for name, curve in light.curves.items()} for light in self._lights)
+        if any(own != first for own in others):
+            raise Apart("curves")
+        return self._lights[0].curves
 
     def _shared(self, name: str):
         """What all lights have in common: a function or property of their class, a neighbour, a plain value."""

@@ -22,7 +22,7 @@ from types import MappingProxyType, ModuleType
 
 import numpy as np
 
-from optics.errors import BadCapture, BadPlugin, BadScene, OutOfBounds, UnknownKey
+from optics.errors import Apart, BadCapture, BadPlugin, BadScene, OutOfBounds, UnknownKey
 from optics.files.output import shipped
 from optics.scene.declare import CATEGORIES, IMAGE_STAGES, STAGES, Effect, Part
 from optics.scene.parameter import Parameter
@@ -265,7 +265,7 @@ def default() -> Registry:
 
 
 # -- what a plugin does wrong when it runs ----------------------------------------------------------------------------
-OURS = (BadPlugin, BadScene, BadCapture, UnknownKey, OutOfBounds)  # errors that say by themselves what is wrong
+OURS = (Apart, BadPlugin, BadScene, BadCapture, UnknownKey, OutOfBounds)  # errors that say by themselves what is wrong
 
 
 def _guarded(item: Part | Effect) -> Part | Effect:

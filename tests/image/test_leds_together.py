@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from optics.errors import Apart
 from optics.light.renderer import Renderer
-from optics.light.together import Apart, Together, alike
+from optics.light.together import Together, alike
 from optics.scene import loader
 
 SMALL = {"width": "32", "height": "24"}
@@ -93,6 +94,32 @@ def test_what_is_not_alike(mitsuba):
             ask()
 
 
+def test_shadows_follow_the_board(mitsuba):
+    """What LEDs see of the face is kept while they stand where they do, their board too: it was not asked, and shadows
+    depended on what had been rendered before."""
+    scene, values = pressed("gelsight_bench")
+    (board,) = scene.boards
+    moved = {**values, f"{board}.x": values[f"{board}.x"] + 4.0, f"{board}.z": values[f"{board}.z"] + 4.0}
+    led = next(iter(scene.leds))
+    for together in (set(), set(scene.leds)):
+        before, fresh = Renderer(scene), Renderer(scene)
+        before.together = fresh.together = together
+        still = before.led(values, led).radiance
+        found, expected = before.led(moved, led).radiance, fresh.led(moved, led).radiance
+        assert np.abs(found - expected).max() < 1e-5 * expected.max()
+        assert np.abs(found - still).max() > 0.1 * expected.max()
+
+
+def test_different_spectra_excite_a_pigment_one_by_one(mitsuba):
+    """A pigment asks each LED for its measured spectrum."""
+    import mitsuba as mi
+
+    lights = list(loader.load("digit", SMALL).leds.values())
+    with pytest.raises(Apart):
+        assert Together(lights, mi.UInt32([0, 1, 2])).curves
+    assert Together(lights[:1], mi.UInt32([0, 0])).curves is lights[0].curves
+
+
 def test_rings(mitsuba):
     """What a part holds besides its numbers, such as how many LEDs a ring has, is the same of all that are alike."""
     scene = loader.load("particle_gel", {**SMALL, "beads": "3"})
@@ -112,7 +139,8 @@ def test_rings(mitsuba):
 
 
 def test_effects_that_ask_one_led(mitsuba, tmp_path):
-    """An effect of one's own may ask its LED for a Python number: then images are made one by one."""
+    """With plugins of one's own, which may ask their LED for a Python number, images are made one by one; so they are
+    where it turns out that this must be."""
     (tmp_path / "near.py").write_text(
         '''"""Near: light falls with the LED's height.
 
@@ -140,6 +168,8 @@ effect = Effect(
     values = {**scene.values(), **{f"{led}.near": 0.1 for led in scene.leds}}
     one_by_one, at_once, at_rest = Renderer(scene), Renderer(scene), Renderer(scene)
     at_once.together = at_rest.together = set(scene.leds)
+    assert at_once.apart and at_rest.apart
+    at_once.apart = at_rest.apart = False
     for led in scene.leds:
         assert (at_once.led(values, led).radiance == one_by_one.led(values, led).radiance).all()
     assert at_once.apart
