@@ -26,7 +26,7 @@ import numpy as np
 from optics.errors import Apart, BadScene
 from optics.light import paths
 from optics.light.samples import Finer, Hits, LedImage, Sample, around, creases, edges
-from optics.light.together import Group, alike
+from optics.light.together import Group, alike, numbers_of
 from optics.processes import return_memory
 from optics.scene.images import bend, finer_of, from_parts, in_parts, repeated
 from optics.scene.loader import Scene
@@ -565,7 +565,7 @@ class Renderer:
         rays, as on a painted face."""
         parts = [self.scene.leds[name] for name in leds]
         group = Group(parts, hits.sample, hits.valid.size)
-        group.visible = self._unshaded_together(hits, group)
+        group.visible = self._reached(hits, parts, lambda: self._visible(group.centres().si, group.at_centres()))
         seen = self._seen(group.visible).reshape(-1, len(parts), *hits.shape)
         rims = self._rim(hits, seen)
         indices, few, shares = zip(*(self._sampled(hits, part, rim) for part, rim in zip(parts, rims)))
@@ -575,11 +575,11 @@ class Renderer:
         finer = group.split(self._in_pixels(np.concatenate(indices), np.concatenate(few)), list(map(len, indices)))
         if group.finer is not None:
             group.rim_visible = self._visible(group.finer.si, group.at_finer())
-        raw = self._raw_together(
-            group,
-            lambda: self._shade(group.centres(), group.at_centres(), group.visible),
-            lambda: self._shade(group.finer, group.at_finer(), group.rim_visible),
-        )
+        (centres,) = self._bands([self._shade(group.centres(), group.at_centres(), group.visible)])
+        fine = None
+        if group.finer is not None:
+            (fine,) = self._bands([self._shade(group.finer, group.at_finer(), group.rim_visible)])
+        raw = group.apart(centres, fine)
         found = {}
         for k, name in enumerate(leds):
             lit = seen[:, k].mean(0) > 0.5
@@ -587,19 +587,6 @@ class Renderer:
             image.share, image.raw = shares[k], raw[k]
             image.radiance = self._mix(image, image.raw)
         return found
-
-    def _raw_together(self, group: Group, centre: Callable, rim: Callable) -> list[tuple]:
-        """`_raw` of each LED of a group."""
-        (centres,) = self._bands([centre()])
-        fine = self._bands([rim()])[0] if group.finer is not None else None
-        return group.apart(centres, fine)
-
-    def _unshaded_together(self, hits: Hits, group: Group):
-        """`_unshaded` of several LEDs."""
-        key = tuple(_standing(part) for part in group.lights)
-        if hits.lit.get("", ((), None))[0] != key:
-            hits.lit[""] = key, self._visible(group.centres().si, group.at_centres())
-        return hits.lit[""][1]
 
     def _render_crowded(self, hits: Hits, led: str, seed: int) -> LedImage:
         """The image of one LED in a crowded scene: finer samples in all pixels, few where no outline is."""
@@ -639,11 +626,15 @@ class Renderer:
         return hits.joint
 
     def _unshaded(self, hits: Hits, part):
-        """`_visible` at pixel centres, kept for as long as the light stands where it does."""
-        key = _standing(part)
-        if hits.lit.get(part.name, ((), None))[0] != key:
-            hits.lit[part.name] = key, self._visible(hits.si, part)
-        return hits.lit[part.name][1]
+        """`_visible` at pixel centres, kept."""
+        return self._reached(hits, [part], lambda: self._visible(hits.si, part))
+
+    def _reached(self, hits: Hits, parts: Sequence, see: Callable):
+        """What `see` finds that lights reach of the pixels' centres, kept for as long as they stand where they do."""
+        names, standing = tuple(part.name for part in parts), [_standing(part) for part in parts]
+        if names not in hits.lit or hits.lit[names][0] != standing:
+            hits.lit[names] = standing, see()
+        return hits.lit[names][1]
 
     # -- what layers leave of it --------------------------------------------------------------------------------------
     def image(self, values: Mapping, light: str, component: int = 0, seed: int = 0) -> np.ndarray:
@@ -1067,14 +1058,10 @@ class Renderer:
         group, lit = image.group, self.lit(values)
         if self.apart or group is None or not all(name in lit for name in group.names):
             return []
-        wanted = [self._of(key, image.led, name) for key in keys for name in group.names]
+        wanted = [_of(key, image.led, name) for key in keys for name in group.names]
         found = [self._images.get(self._image_key(values, name, seed)) for name in group.names]
         alike = all(mate is not None and mate.group is group for mate in found)
         return found if alike and self.asked.issuperset(wanted) else []
-
-    def _of(self, key: str, led: str, other: str) -> str:
-        """The key of an LED's own parameter, of another LED; any other key as it is."""
-        return f"{other}.{key.rsplit('.', 1)[1]}" if key.rsplit(".", 1)[0] == led else key
 
     def _tangents_of(
         self, values: Mapping, image: LedImage, keys: Sequence[str], mates: Sequence[LedImage] = ()
@@ -1093,7 +1080,7 @@ class Renderer:
 
         def value_of(key):
             """Of several LEDs, one value for each."""
-            return group.numbers(own[key]) if key in own else getattr(*places[key])
+            return numbers_of(group.lights, own[key]) if key in own else getattr(*places[key])
 
         @contextmanager
         def put(numbers):
@@ -1160,7 +1147,7 @@ class Renderer:
         if group is None:
             return {image: dict(zip(keys, zip(centres, finely)))}
         each = zip(*(group.apart(c, f) for c, f in zip(centres, finely)))
-        return {m: {self._of(k, image.led, m.led): r for k, r in zip(keys, raw)} for m, raw in zip(mates, each)}
+        return {m: {_of(k, image.led, m.led): r for k, r in zip(keys, raw)} for m, raw in zip(mates, each)}
 
     def bounced(
         self, values: Mapping, led: str, seed: int = 0, component: int = 0, roughly: bool = False
@@ -1320,10 +1307,16 @@ def _power_of_two(number: float) -> int:
     return 1 << math.ceil(math.log2(number))
 
 
+def _of(key: str, led: str, other: str) -> str:
+    """The key of an LED's own parameter, of another LED; any other key as it is."""
+    name, _, number = key.rpartition(".")
+    return f"{other}.{number}" if name == led else key
+
+
 def _standing(light) -> tuple:
-    """A light's name and all numbers that it and its board have: what its shadows depend on, and more."""
+    """All numbers that a light and its board have: what its shadows depend on, and more."""
     board = getattr(light, "board", None)
-    return (light.name, *light.held.values(), *(board.held.values() if board is not None else ()))
+    return (*light.held.values(), *(board.held.values() if board is not None else ()))
 
 
 def _board(light) -> str:

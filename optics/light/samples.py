@@ -34,7 +34,7 @@ class Hits:
         self.shape = (height, width)
         self.rims: dict = {}
         self.joint: np.ndarray | None = None
-        self.lit: dict[str, tuple] = {}  # what lights see of the pixels' centres, by what it was found for
+        self.lit: dict[tuple[str, ...], tuple] = {}  # what lights see of the pixels' centres, with their numbers then
         self.eye = np.zeros(3)  # where the camera stood
         self.valid = np.array(self.si.is_valid()).reshape(height, width)
         self.edges = edges(self.valid)

@@ -37,7 +37,8 @@ class Together:
 
         first = self._lights[0]
         if name in first.numbers:
-            value = dr.gather(mi.Float, self._table(name), self._lane)
+            table = self._given[name] if name in self._given else numbers_of(self._lights, name)
+            value = dr.gather(mi.Float, table, self._lane)
         elif name == FRAME:
             axes = np.array([_frame(light) for light in self._lights], np.float32).transpose(1, 2, 0)
             value = [dr.gather(mi.Vector3f, mi.Vector3f(np.ascontiguousarray(own)), self._lane) for own in axes]
@@ -69,12 +70,6 @@ class Together:
         if first is not Apart and all(o is first or (type(o) in PLAIN and o == first) for o in others):
             return first
         raise Apart(name)
-
-    def _table(self, name: str):
-        """A number of each light."""
-        import mitsuba as mi
-
-        return self._given.get(name, mi.Float([light.held[name] for light in self._lights]))
 
     def spectrum(self, wavelengths):
         """Measured spectra are looked up light by light."""
@@ -111,6 +106,13 @@ class Together:
         own = {e.stages[stage]: e for e in self.registry.at_stage(self.kind, stage)}
         moved = [f for f, e in own.items() if any(n in self._given for n in e.at_rest)]
         return tuple(f for f in own if f in asked or f in moved)
+
+
+def numbers_of(lights: Sequence, name: str):
+    """A number of each light (Dr.Jit)."""
+    import mitsuba as mi
+
+    return mi.Float([light.held[name] for light in lights])
 
 
 def _frame(light) -> np.ndarray:
@@ -158,12 +160,6 @@ class Group:
         self.sizes = [0] * len(self.names)
         lanes = dr.arange(mi.UInt32, len(self.names) * pixels)
         self._pixel, self._light, self._fine_light = lanes % pixels, lanes // pixels, None
-
-    def numbers(self, name: str):
-        """A number of each light (Dr.Jit)."""
-        import mitsuba as mi
-
-        return mi.Float([light.held[name] for light in self.lights])
 
     def centres(self) -> Sample:
         """The ends of rays at pixels' centres, in every lane."""

@@ -36,7 +36,7 @@ def test_images(mitsuba, name):
     for led in scene.leds:
         expected, found = one_by_one.led(values, led), at_once.led(values, led)
         at_once_made += found.group is not None
-        largest = expected.radiance.max()
+        largest = expected.radiance.max()  # single precision, in which the same light takes another way
         assert largest > 0 and np.abs(found.radiance - expected.radiance).max() < 1e-5 * largest
         assert (found.rim == expected.rim).all() and (found.index == expected.index).all()
         assert (np.array(found.visible) == np.array(expected.visible)).all()
@@ -94,7 +94,7 @@ def test_what_is_not_alike(mitsuba):
 
 
 def test_shadows_follow_the_board(mitsuba):
-    """What LEDs see of the face is kept while they stand where they do, their board too: it was not asked, and shadows
+    """Shadows are kept only while an LED and its board stay where they are. The board was forgotten, and shadows
     depended on what had been rendered before."""
     scene, values = pressed("gelsight_bench")
     (board,) = scene.boards
@@ -109,8 +109,8 @@ def test_shadows_follow_the_board(mitsuba):
         assert np.abs(found - still).max() > 0.1 * expected.max()
 
 
-def test_different_spectra_excite_a_pigment_one_by_one(mitsuba):
-    """A pigment asks each LED for its measured spectrum."""
+def test_different_spectra_are_asked_one_by_one(mitsuba):
+    """By a pigment, which computes from an LED's measured spectrum how much of it is absorbed."""
     import mitsuba as mi
 
     lights = list(loader.load("digit", SMALL).leds.values())
