@@ -312,9 +312,13 @@ class SceneModel:
         return image.mean(-1)
 
     def untouched(self, now: Mapping) -> dict:
-        """The same frame with the gel at rest."""
-        keys = (self.scene.key(self.scene.gel.name, role) for role in ("press x", "press y", "press depth"))
-        return {**now, **dict.fromkeys((key for key in keys if key), 0.0)}
+        """The same frame with the gel at rest. What does nothing there is put back to where it began, so that it is the
+        same gel for all presses and whatever they are like."""
+        gel = self.scene.gel.name
+        keys = (self.scene.key(gel, role) for role in ("press x", "press y", "press depth"))
+        pressing = (f"{gel}.{name}" for name in getattr(self.scene.gel, "pressing", ()))
+        same = {key: self.base[key] for key in pressing if key in self.base}
+        return {**now, **same, **dict.fromkeys((key for key in keys if key), 0.0)}
 
     def _at_rest(self, untouched: Mapping, index: int, seed: int) -> np.ndarray:
         """`radiance` of the untouched gel, which all presses share."""

@@ -326,11 +326,19 @@ class Renderer:
         if self.crowded:
             hits.edges |= creases(np.where(hits.valid[..., None], hits.normal, 0.0)) | self._parted(values)
         hits.edges |= self._painted(hits)
+        hits.bare = self._bare(hits)
         self._hits[key] = hits
         while len(self._hits) > self.remember:
             self._hits.popitem(last=False)
         self._make_room(hits, hits.valid.size)
         return hits
+
+    def _bare(self, hits: Hits) -> bool:
+        """Whether the skin is level and nothing but windows stands beside it: no light casts a shadow, and no pixel
+        needs finer samples, so that the mesh need not be brought there again."""
+        if self.layered or self.crowded or hits.edges.any() or not getattr(self.scene.gel, "level", False):
+            return False
+        return all(shape is self.scene.gel or _is_window(shape) for shape in self._world().shapes())
 
     def _eye(self) -> np.ndarray:
         """(3,) where the camera stands, mm."""
@@ -432,7 +440,7 @@ class Renderer:
         if alike := self._placed_alike(key):
             self.apply(values, move=False)
             return self._keep(key, self._shaded_again(alike))
-        self.apply(values)
+        self.apply(values, move=not hits.bare)
         # moving the geometry costs more than an image: make what will be asked for next
         keys = {led: key}
         for other in sorted(self.together - {led}):
@@ -517,9 +525,7 @@ class Renderer:
         most = TOGETHER // hits.valid.size
         if self.apart or self.layered or self.crowded or self.integral is not None or min(most, len(leds)) < 2:
             return [[name] for name in leds]
-        from optics.light.led_by_led import is_interface
-
-        faces = [s.bbox().max.z for s in self._world().shapes() if is_interface(s)]
+        faces = [s.bbox().max.z for s in self._world().shapes() if _is_window(s)]
         lights = [self.scene.leds[name] for name in leds if name in self.scene.leds]
         groups = [[light.name for light in own] for own in alike(lights, faces)]
         groups += [[name] for name in leds if name not in self.scene.leds]
@@ -565,7 +571,7 @@ class Renderer:
         rays, as on a painted face."""
         parts = [self.scene.leds[name] for name in leds]
         group = Group(parts, hits.sample, hits.valid.size)
-        group.visible = self._reached(hits, parts, lambda: self._visible(group.centres().si, group.at_centres()))
+        group.visible = self._reached(hits, parts, lambda: self._visible(group.centres().si, group.at_centres(), hits.bare))
         seen = self._seen(group.visible).reshape(-1, len(parts), *hits.shape)
         rims = self._rim(hits, seen)
         indices, few, shares = zip(*(self._sampled(hits, part, rim) for part, rim in zip(parts, rims)))
@@ -627,7 +633,7 @@ class Renderer:
 
     def _unshaded(self, hits: Hits, part):
         """`_visible` at pixel centres, kept."""
-        return self._reached(hits, [part], lambda: self._visible(hits.si, part))
+        return self._reached(hits, [part], lambda: self._visible(hits.si, part, hits.bare))
 
     def _reached(self, hits: Hits, parts: Sequence, see: Callable):
         """What `see` finds that lights reach of the pixels' centres, kept for as long as they stand where they do."""
@@ -834,11 +840,15 @@ class Renderer:
         u, v = ((corner[:, None] + place).astype(np.float32) for corner, place in zip(corners, places))
         return u, v
 
-    def _visible(self, si, part):
-        """Share of the LED that each hit sees; a Float (a mask for a point source)."""
+    def _visible(self, si, part, bare: bool = False):
+        """Share of the LED that each hit sees; a Float (a mask for a point source). bare: nothing casts shadows."""
         import drjit as dr
 
         integrator = self.scene.integrator
+        if bare:
+            valid = si.is_valid()
+            dr.eval(valid)
+            return [valid] * len(part.places()) if len(part.places()) > 1 else valid
         share = []
         for point in integrator.spots(part):
             share.append(integrator.visible(self._world(), si, dr.detach(point), part))
@@ -1171,6 +1181,8 @@ class Renderer:
         key = ("bounced", seed, samples, *self._led_key(values, led))
         if key in self._plain:
             return self._bounced(values, led, self._plain[key], component)
+        if self.hits(values).bare:  # a level skin does not meet itself, and windows mirror nothing back to it
+            return self._parts_of(np.zeros((self.height, self.width, self.bands), np.float32))
         self.apply(values)
         sample, numbers, met = self._spread(values, seed, samples)
         for other in (led, *sorted(self.together - {led})):  # as for direct light: these will be asked for next
@@ -1300,6 +1312,12 @@ class Directions:
         import mitsuba as mi
 
         return mi.Point2f(next(self._numbers), next(self._numbers))
+
+
+def _is_window(shape) -> bool:
+    from optics.light.led_by_led import is_interface  # once a variant is set
+
+    return is_interface(shape)
 
 
 def _power_of_two(number: float) -> int:

@@ -36,6 +36,7 @@ class Hits:
         self.joint: np.ndarray | None = None
         self.lit: dict[tuple[str, ...], tuple] = {}  # what lights see of the pixels' centres, with their numbers then
         self.eye = np.zeros(3)  # where the camera stood
+        self.bare = False  # whether nothing casts a shadow on what is seen, and no pixel needs finer samples
         self.valid = np.array(self.si.is_valid()).reshape(height, width)
         self.edges = edges(self.valid)
         if self.path is not None:  # what is passed, and what is met, changes at an edge

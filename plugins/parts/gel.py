@@ -350,6 +350,7 @@ def build():
             mi.Mesh.__init__(self, "gel", index.size, len(faces), props, True, False)
             self.declare(props)
             self._map = None
+            self.level = False  # whether all of the face lies in one plane across the camera's axis
             self.seen_touch = None  # of which a texture was made
             self.recalled = None  # another geometry than the mesh is in, as `recall` has it
             if self.indenter.lower().endswith(contact.FILES):
@@ -484,6 +485,7 @@ def build():
             """Vertices of the face for the present parameters."""
             xs, ys = self.axes()
             z = chord_corrected(self.heights(xs, ys), xs, ys)
+            self.level = not np.ptp(z)
             x, y = np.broadcast_to(xs, z.shape), np.broadcast_to(ys[:, None], z.shape)
             params["vertex_positions"] = mi.Float(np.stack([x, y, z], -1).astype(np.float32).ravel())
             params.update()

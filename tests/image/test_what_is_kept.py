@@ -111,3 +111,14 @@ def test_a_second_seed_renders_only_what_depends_on_it(scene, share):
     same = {k for k in keys if np.shares_memory(found[0][k], found[1][k])}
     assert same == (set() if share else set(keys) - {second})
     assert not any(np.array_equal(found[0][k], found[1][k]) for k in set(keys) - same)
+
+
+def test_presses_share_the_gel_at_rest_whatever_they_are_like(scene):
+    shape = (int(SMALL["height"]), int(SMALL["width"]), 3)
+    frame = Frame("press", np.zeros(shape, np.float32), parameters={"gel.press_depth": 0.8})
+    model = SceneModel(scene, Captures(Path("."), str(scene.path), [frame], noise=Noise(0.1, 1.0, 0.0, 255.0, 0.0)))
+    plain, other = (
+        model.untouched(model.at(Values(more), 0)) for more in ({}, {"gel.skirt": 0.5, "gel.indenter_size": 3.0})
+    )
+    curved = model.untouched(model.at(Values({"gel.curve_xx": 2e-3}), 0))
+    assert model.renderer.geometry(plain) == model.renderer.geometry(other) != model.renderer.geometry(curved)
