@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -37,11 +38,12 @@ def judge(case: Case, outcome: Outcome) -> tuple[Outcome, list[Level]]:
     while another one predicts them better: a few angles may not tell an analyser that wobbles from a lamp that drifts,
     where a further angle does."""
     found: dict[frozenset[str], list[Level]] = {}
+    base = Base.of(case) if case.held_out else None
 
     def levels_of(t: Trial) -> list[Level]:
         if t.names not in found:
             wander = 0.0 if case.evidence.is_table else wander_of(case, outcome, t)
-            found[t.names] = levels(case, t.members, t.fit, wander)
+            found[t.names] = levels(case, base, t.members, t.fit, wander)
         return found[t.names]
 
     while case.held_out and len(outcome.survivors) > 1:
@@ -56,28 +58,53 @@ def judge(case: Case, outcome: Outcome) -> tuple[Outcome, list[Level]]:
     return outcome, levels_of(outcome.best)
 
 
-def levels(case: Case, members: Sequence[Candidate], with_them: Fit, wander: float = 0.0) -> list[Level]:
+@dataclass(frozen=True)
+class Base:
+    """The base on held-out frames.
+
+    pose      variables that each has for itself, which were fitted there
+    predictions, masks, sds   (H, W, C) of each frame
+    """
+
+    pose: list[Variable]
+    values: Values
+    predictions: list[np.ndarray]
+    masks: list[np.ndarray]
+    sds: list[np.ndarray]
+
+    @classmethod
+    def of(cls, case: Case) -> Base:
+        case.say("held-out frames", 0, 2)
+        pose = for_frames(case.model, case.fit.variables, case.held_out)
+        predictions, values = _predicted(case, case.fit.values.copy(), pose)
+        masks, sds = [], []
+        for f, prediction in zip(case.held_out, predictions):
+            variance = case.evidence.variance(case.model, f, prediction, values)
+            masks.append(np.asarray(case.model.usable(f), bool) & np.isfinite(prediction))
+            sds.append(np.sqrt(np.where(masks[-1], variance, 1.0)))
+        return cls(pose, values, predictions, masks, sds)
+
+
+def levels(
+    case: Case, on_held_out: Base | None, members: Sequence[Candidate], with_them: Fit, wander: float = 0.0
+) -> list[Level]:
     """Misfit of the base and, if there are any, of the base with effects, on fitted and on held-out frames, where the
     lamp wanders.
 
     A strength per frame is found on one half of a held-out frame and judged on the other."""
-    evidence, fit, held_out, say = case.evidence, case.fit, case.held_out, case.say
+    evidence, held_out, say = case.evidence, case.held_out, case.say
     before, after = evidence.normal.square, chi2(case, with_them.values)[0] if members else math.nan
     name = " + ".join(c.effect.name for c in members)
 
-    if not held_out:
+    if on_held_out is None:
         found = [_level(case, "base", before)]
         return found + ([_level(case, name, after)] if members else [])
-    say("held-out frames", 0, 2)
-    pose = for_frames(case.model, fit.variables, held_out)
-    predictions_of_base, base_values = _predicted(case, fit.values.copy(), pose)
-    masks, sds, base = [], [], []
-    for f, prediction in zip(held_out, predictions_of_base):
-        variance = evidence.variance(case.model, f, prediction, base_values)
-        use = np.asarray(case.model.usable(f), bool) & np.isfinite(prediction)
-        masks.append(use)
-        sds.append(np.sqrt(np.where(use, variance, 1.0)))
-        base.append(_square(case.model, f, prediction, use, sds[-1], wander))
+    pose, base_values, predictions_of_base = on_held_out.pose, on_held_out.values, on_held_out.predictions
+    masks, sds = on_held_out.masks, on_held_out.sds
+    base = [
+        _square(case.model, f, prediction, use, sd, wander)
+        for f, prediction, use, sd in zip(held_out, predictions_of_base, masks, sds)
+    ]
     count = int(sum(m.sum() for m in masks))
     found = [_level(case, "base", before, sum(base), count)]
     if not members or not count:

@@ -3,7 +3,8 @@
 A fit of images keeps little more than one core busy, as Python records what Dr.Jit then runs. A model that can be
 opened again (`SceneModel.recipe`) is opened in further processes once a fit has taken START seconds, and each of
 them then makes the images of frames of its own: all frames of a press where there are presses enough, as they share
-what was traced. The numbers are those of one process, to rounding.
+what was traced. Where there is but one, whole refits are shared instead (`Hands.each`): the frames of a press whose
+LEDs are rendered at once take no longer than one of them. The numbers are those of one process, to rounding.
 
 Off until `use_processes` is called, as the command line does: Python starts a process by importing the caller's script
 again, and a script must be written for that (`if __name__ == "__main__":`)."""
@@ -15,8 +16,9 @@ import time
 import weakref
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import suppress
+from functools import partial
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any
@@ -34,6 +36,7 @@ UNEVEN = 1.25  # of the longest share of presses over the mean, beyond which the
 VARIABLE = "OPTICS_PROCESSES"  # of the environment: how many processes at most
 
 Task = Callable[["SceneModel", int], Any]
+Job = Callable[["SceneModel"], Any]
 
 _allowed = 1
 
@@ -134,8 +137,12 @@ class Crew:
             for other in self.others:
                 other.begun.result()
             self.working = True
-            _take_part(model, self.count)
+            self.take_part(model)
         return self.working
+
+    def take_part(self, model: SceneModel) -> None:
+        """Leave to the others their share of cores and memory."""
+        _take_part(model, self.count)
 
     def share(self, frames: Sequence[int]) -> None:
         """Put somebody in charge of frames of which nobody is, so that all have about as many of these frames. A frame
@@ -183,6 +190,51 @@ class Crew:
                 send(k)
             yield made.pop(f)
 
+    def each(self, model: SceneModel, jobs: deque[tuple[int, Job]]) -> Iterator[tuple[int, Any]]:
+        """(number, what it makes) of each job, as they are done; every process takes the next one that waits. Raises
+        Gone, and then puts back what was not done."""
+        everything = frozenset(range(len(model.frames)))
+        sent: dict[Future, tuple[int, Job]] = {}
+        going = True
+
+        def send(other: Helper, last: Future | None = None) -> None:
+            if not going or last is not None and isinstance(last.exception(), Gone):
+                return
+            with suppress(IndexError):  # none waits
+                n, job = jobs.popleft()
+                made = other.make(partial(_done, job=job), n, everything)
+                sent[made] = n, job
+                made.add_done_callback(partial(send, other))
+
+        model.take_charge(everything)
+        self.take_part(model)
+        try:
+            for other in self.others:
+                send(other)
+            while jobs or sent:
+                if jobs:
+                    with suppress(IndexError):  # another process took it
+                        n, job = jobs.popleft()
+                        yield n, job(model)
+                else:
+                    wait(list(sent), return_when=FIRST_COMPLETED)
+                for made in [made for made in list(sent) if made.done()]:
+                    n, job = sent[made]
+                    try:
+                        found = made.result()
+                    except Failed:
+                        found = job(model)
+                    del sent[made]
+                    yield n, found
+        finally:
+            going = False
+            jobs.extend(sent.values())
+            _use_cores(1)
+
+
+def _done(model: SceneModel, number: int, job: Job) -> Any:
+    return job(model)
+
 
 def _uneven(load: Sequence[int], presses: Sequence[Sequence[int]], count: int) -> bool:
     """Whether, of so many frames, somebody would have many more than others if presses, the largest first, went whole
@@ -223,10 +275,14 @@ def _serve(pipe: Connection, recipe: Callable[[], SceneModel], count: int) -> No
 
 def _take_part(model: SceneModel, count: int) -> None:
     """Use as many threads, and as much memory, as one of so many processes may."""
+    _use_cores(count)
+    model.renderer.share_memory(count)
+
+
+def _use_cores(count: int) -> None:
     import drjit as dr
 
     dr.set_thread_count(max(cores() // count, 1))
-    model.renderer.share_memory(count)
 
 
 def _end(others: Sequence[Helper]) -> None:
@@ -261,16 +317,53 @@ class Hands:
             self.worked += time.process_time() - before
             yield made
 
+    def each(self, model: SceneModel, frames: Sequence[int], jobs: Sequence[Job]) -> Iterator[tuple[int, Any]]:
+        """(number, what it makes) of each job, as they are done: in several processes where these would not share the
+        frames that jobs ask for. Each makes all images of its jobs by itself."""
+        waiting = deque(enumerate(jobs))
+        while waiting:
+            crew = self._crew_of(model, waiting) if self.shares_jobs(model, frames) else None
+            if crew is None:
+                n, job = waiting.popleft()
+                yield n, job(model)
+                continue
+            self.crew, self.alone = None, True  # images of this process's jobs are its own
+            try:
+                yield from crew.each(model, waiting)
+            except Gone:
+                crew.end()
+                _take_part(model, 1)
+                continue
+            except BaseException:
+                self.crew, self.alone = crew, False
+                raise
+            self.crew, self.alone = crew, False
+
+    def shares_jobs(self, model: SceneModel, frames: Sequence[int]) -> bool:
+        """Whether processes share jobs that ask for these frames: where they would have to share a press, which one
+        renders as quickly."""
+        most = allowed()
+        if most < 2 or not _shares(model) or not model.renderer.at_once:
+            return False
+        return _shared(model.presses, frames, most)
+
     def _crew(self, model: SceneModel, frames: Sequence[int]) -> Crew | None:
-        """The crew where it is at work; begun where it is time to, and where several frames are asked for.
+        """The crew where frames are shared.
 
         Processes that share the frames of a press each move its geometry: where Dr.Jit keeps the cores busy, they take
         half as long again as one process (six LEDs of one press on two cores)."""
-        if self.crew is None and len(frames) > 1 and self.spent > START and not self.alone:
-            processes, recipe = min(allowed(), len(frames)), model.recipe
+        if len(frames) < 2 or self.shares_jobs(model, frames):
+            return None
+        busy = self.crew is None and self.worked > BUSY * cores() * self.spent
+        if busy and _shared(model.presses, frames, min(allowed(), len(frames))):
+            return None
+        return self._crew_of(model, frames)
+
+    def _crew_of(self, model: SceneModel, parts: Sequence) -> Crew | None:
+        """The crew where it is at work; begun where it is time to, and where there are several parts to share."""
+        if self.crew is None and len(parts) > 1 and self.spent > START and not self.alone:
+            processes, recipe = min(allowed(), len(parts)), model.recipe
             if processes < 2 or recipe is None or not _shares(model):
-                return None
-            if _shared(model.presses, frames, processes) and self.worked > BUSY * cores() * self.spent:
                 return None
             self.crew = Crew(recipe, model.presses, processes)
         try:

@@ -20,7 +20,7 @@ from optics.captures.capture_set import Captures, Frame, cfa_channel, sweeps, wi
 from optics.captures.noise import Noise
 from optics.errors import BadScene, UnknownKey
 from optics.fit import geometry
-from optics.fit.crew import Hands
+from optics.fit.crew import Hands, Job
 from optics.fit.known_shape import ALL, KNOWN, REGIONS, known_shape
 from optics.fit.model import value_of
 from optics.light.development import STEP, Developer, Linear
@@ -343,6 +343,11 @@ class SceneModel:
     def _made(self, frames: Sequence[int] | None, make: Callable, **given: Any) -> Iterator[Any]:
         """What `make` makes of the model and each frame, in this process or in another that has the same model."""
         return self.hands.work(self, self._indices(frames), partial(make, sparing=self.sparing, **given))
+
+    def each(self, frames: Sequence[int], jobs: Sequence[Job]) -> Iterator[tuple[int, Any]]:
+        """(number, what it makes) of each job, a function of the model that asks for images of these frames, as they
+        are done; several at once where processes are allowed and would not share the frames."""
+        return self.hands.each(self, frames, [partial(_made_by, sparing=self.sparing, job=job) for job in jobs])
 
     def _turn_to(self, values: Values, index: int) -> dict:
         """A frame's values; tells the renderer which other LEDs will be asked for in the same geometry, and of which
@@ -878,6 +883,11 @@ class SceneModel:
             return "camera"
         name = key.rpartition(".")[0]
         return self.scene.declaration(name).family if name in self.scene.parts else ""
+
+
+def _made_by(model: SceneModel, sparing: bool, job: Job) -> Any:
+    model.sparing = sparing
+    return job(model)
 
 
 def _predicted(model: SceneModel, index: int, sparing: bool, values: Values, seed: int) -> np.ndarray:

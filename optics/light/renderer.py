@@ -520,10 +520,16 @@ class Renderer:
             found.update((name, self._render_led(hits, name, seed)) for name in names)
         return found
 
+    @property
+    def at_once(self) -> bool:
+        """Whether LEDs over one geometry are rendered at once."""
+        alone = self.apart or self.layered or self.crowded or self.integral is not None
+        return not alone and TOGETHER // (self.width * self.height) > 1
+
     def _alike(self, hits: Hits, leds: Sequence[str]) -> list[list[str]]:
         """The LEDs in groups that are rendered at once."""
         most = TOGETHER // hits.valid.size
-        if self.apart or self.layered or self.crowded or self.integral is not None or min(most, len(leds)) < 2:
+        if not self.at_once or len(leds) < 2:
             return [[name] for name in leds]
         faces = [s.bbox().max.z for s in self._world().shapes() if _is_window(s)]
         lights = [self.scene.leds[name] for name in leds if name in self.scene.leds]
@@ -571,7 +577,9 @@ class Renderer:
         rays, as on a painted face."""
         parts = [self.scene.leds[name] for name in leds]
         group = Group(parts, hits.sample, hits.valid.size)
-        group.visible = self._reached(hits, parts, lambda: self._visible(group.centres().si, group.at_centres(), hits.bare))
+        group.visible = self._reached(
+            hits, parts, lambda: self._visible(group.centres().si, group.at_centres(), hits.bare)
+        )
         seen = self._seen(group.visible).reshape(-1, len(parts), *hits.shape)
         rims = self._rim(hits, seen)
         indices, few, shares = zip(*(self._sampled(hits, part, rim) for part, rim in zip(parts, rims)))

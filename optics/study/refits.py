@@ -9,13 +9,15 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Callable, Sequence
-from functools import cached_property
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property, partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from optics.diagnosis.refit import COARSE, ROUGH, Cooled, further
+from optics.diagnosis.refit import COARSE, FAILURES, ROUGH, Cooled, further
 from optics.diagnosis.thresholds import CLEAR, MISSTATED
 from optics.files.output import write_text
 from optics.fit import calibrate
@@ -70,16 +72,43 @@ class Refits:
         excess = max(self.base.chi2 - count, 1.0)
         return COARSE * float(np.clip(shared / excess, 0.0, 1.0))
 
-    def foresee(self, sets: Sequence[Sequence[Variable]], say: Callable[[str, int, int], None]) -> None:
-        """Chord steps of each set of variables, so that the best is known before any is calibrated."""
-        if not self.by_chords():
+    def foresee(
+        self, sets: Sequence[Sequence[Variable]], say: Callable[[str, int, int], None], idly: bool = False
+    ) -> None:
+        """Chord steps of each set of variables, so that the best is known before any is calibrated; of one press, their
+        calibrations as well, in as many processes as there are. idly: only where one would have nothing to do."""
+        together = self.model.hands.shares_jobs(self.model, self.base.frames)
+        if not self.by_chords() or (idly and not together):
             return
-        for n, extra in enumerate(sets):
+        wanted = [extra for extra in sets if self.curved(extra) < 2 and not self._begun(extra)]
+        say("chord steps", len(sets) - len(wanted), len(sets))
+        jobs = [partial(_tried, make=partial(_chord, **self._chord_of(extra))) for extra in wanted]
+        made = self.model.each(self.base.frames, jobs)
+        for n, (k, quick) in enumerate(made, len(sets) - len(wanted) + 1):
+            if quick is not None:
+                self.chords[_names(wanted[k])] = self._as_ours(quick, wanted[k])
             say("chord steps", n, len(sets))
-            known = tuple(v.name for v in extra) in self.starts or self.taken_up(extra) is not None
-            if self.curved(extra) < 2 and not known:
-                self.chord(extra)
-        say("chord steps", len(sets), len(sets))
+        if together:
+            self._calibrate_ahead([extra for extra in wanted if _names(extra) in self.chords], say)
+
+    def _calibrate_ahead(self, sets: Sequence[Sequence[Variable]], say: Callable[[str, int, int], None]) -> None:
+        """The calibrations that chord steps call for, several at once."""
+        leader = self.leader() if sets else 0.0
+        open_ = [extra for extra in sets if self.unfinished(self.chords[_names(extra)], leader)]
+        jobs = [partial(_tried, make=partial(_calibrated, **self._calibrated_of(extra, leader))) for extra in open_]
+        for n, (k, found) in enumerate(self.model.each(self.base.frames, jobs), 1):
+            if found is not None:
+                self.results[_names(open_[k])] = found = self._as_ours(found, open_[k])
+                self.keep(found, open_[k])
+            say("calibrations", n, len(open_))
+
+    def _as_ours(self, found: Fit, extra: Sequence[Variable]) -> Fit:
+        """A fit that another process may have made, with this one's variables."""
+        return replace(found, variables=[*self.base.variables, *extra])
+
+    def _begun(self, extra: Sequence[Variable]) -> bool:
+        names = _names(extra)
+        return names in self.starts or names in self.chords or self.taken_up(extra) is not None
 
     def of(self, model: SceneModel, variables: Sequence[Variable], start: Values, frames: Sequence[int]) -> Fit:
         """The fit of these variables from this start."""
@@ -92,7 +121,7 @@ class Refits:
         if found is None:
             found = self.resumed(variables, names, frames)
             if found is None and self.curved(extra) < 2:
-                found = self.calibrated(variables, extra, frames)
+                found = self.calibrated(extra)
             elif found is None:  # a chord per parameter misses their products
                 found = calibrate.fit_over_starts(
                     model, variables, start, frames, tolerance=ROUGH, over=over, negligible=self.coarse
@@ -120,32 +149,42 @@ class Refits:
 
     def chord(self, extra: Sequence[Variable]) -> Fit:
         """The fit by chord steps."""
-        names = tuple(v.name for v in extra)
+        names = _names(extra)
         if names not in self.chords:
-            steps = {n: self.steps[n] for n in names if n in self.steps}
-            self.chords[names] = calibrate.extended(
-                self.model, self.base, extra, steps, seed=self.setup.seed, negligible=self.coarse
-            )
+            self.chords[names] = _chord(self.model, **self._chord_of(extra))
         return self.chords[names]
 
-    def calibrated(self, variables: Sequence[Variable], extra: Sequence[Variable], frames: Sequence[int]) -> Fit:
-        """The fit by chord steps, and where these have no end but come near the best, or were promised to, a
-        calibration that continues them; where that falls short of what was promised, one from the study's start values:
-        a strong effect may have bent the base's values far from the truth. What was promised as much as the best is
-        followed to its end, since where chord steps have stuck nothing more is promised."""
-        quick = self.chord(extra)
-        leader = max(map(self.fall, (*self.chords.values(), *self.results.values())))
-        near, enough = PROMISING * leader, AS_PROMISED * quick.promised
-        if (quick.converged and self.fall(quick) > enough) or not max(self.fall(quick), quick.promised) > near:
-            return quick
-        asked = math.inf if quick.promised > near else self.minimised(self.base) - near
-        longer = further(self.model, variables, quick.values, frames, asked=asked, negligible=self.coarse)
-        best = min((longer, quick), key=self.minimised)
-        if self.fall(best) > enough or self.minimised(best) > asked:
-            return best
-        values = off_neutral(self.model, Values(dict(self.setup.values)), extra)
-        afresh = fit_base(self.model, variables, frames, values, tolerance=ROUGH, negligible=self.coarse)
-        return min((best, afresh), key=self.minimised)
+    def _chord_of(self, extra: Sequence[Variable]) -> dict[str, Any]:
+        """What `_chord` needs beside the model."""
+        steps = {v.name: self.steps[v.name] for v in extra if v.name in self.steps}
+        return {"base": self.base, "extra": extra, "steps": steps, "seed": self.setup.seed, "negligible": self.coarse}
+
+    def leader(self) -> float:
+        """The best fall so far."""
+        return max(map(self.fall, (*self.chords.values(), *self.results.values())))
+
+    def unfinished(self, quick: Fit, leader: float) -> bool:
+        """Whether chord steps have no end but come near the best, or were promised to."""
+        ended = quick.converged and self.fall(quick) > AS_PROMISED * quick.promised
+        return not ended and max(self.fall(quick), quick.promised) > PROMISING * leader
+
+    def calibrated(self, extra: Sequence[Variable]) -> Fit:
+        """The fit by chord steps, or the calibration that these call for."""
+        quick, leader = self.chord(extra), self.leader()
+        return (
+            _calibrated(self.model, **self._calibrated_of(extra, leader)) if self.unfinished(quick, leader) else quick
+        )
+
+    def _calibrated_of(self, extra: Sequence[Variable], leader: float) -> dict[str, Any]:
+        """What `_calibrated` needs beside the model."""
+        quick, before, near = self.chord(extra), self.minimised(self.base), PROMISING * leader
+        return {
+            "quick": quick,
+            "enough": before - AS_PROMISED * quick.promised,
+            "asked": math.inf if quick.promised > near else before - near,
+            "start": off_neutral(self.model, Values(dict(self.setup.values)), extra),
+            "negligible": self.coarse,
+        }
 
     def cooler(self, refits: Sequence[Fit]) -> Cooled | None:
         """What a diagnosis begins again from, given its refits, the best first: the base with priors that count as the
@@ -202,7 +241,7 @@ class Refits:
         return self.minimised(self.base) - self.minimised(found)
 
     def minimised(self, found: Fit) -> float:
-        return found.chi2 + prior_terms(self.model, found.variables, found.values)[2]
+        return _minimised(self.model, found)
 
     # -- kept in the study --------------------------------------------------------------------------------------------
     def taken_up(self, extra: Sequence[Variable]) -> Fit | None:
@@ -259,3 +298,42 @@ class Refits:
             )
         except (ValueError, KeyError, TypeError):
             return None
+
+
+# -- which any process may make ----------------------------------------------------------------------------------------
+def _names(extra: Sequence[Variable]) -> tuple[str, ...]:
+    return tuple(v.name for v in extra)
+
+
+def _tried(model: SceneModel, make: Callable[[SceneModel], Fit]) -> Fit | None:
+    """None where a refit has no result: whoever asks for it later learns why."""
+    try:
+        return make(model)
+    except FAILURES:
+        return None
+
+
+def _minimised(model: SceneModel, found: Fit) -> float:
+    return found.chi2 + prior_terms(model, found.variables, found.values)[2]
+
+
+def _chord(
+    model: SceneModel, base: Fit, extra: Sequence[Variable], steps: Mapping[str, float], seed: int, negligible: float
+) -> Fit:
+    return calibrate.extended(model, base, extra, steps, seed=seed, negligible=negligible)
+
+
+def _calibrated(model: SceneModel, quick: Fit, enough: float, asked: float, start: Values, negligible: float) -> Fit:
+    """A calibration that continues chord steps; where that falls short of what was promised, one from the study's start
+    values: a strong effect may have bent the base's values far from the truth. What was promised as much as the best is
+    followed to its end, since where chord steps have stuck nothing more is promised.
+
+    enough   what is minimised where as much as was promised is reached;   asked: at a rival of the best, at most
+    """
+    variables, frames = quick.variables, quick.frames
+    longer = further(model, variables, quick.values, frames, asked=asked, negligible=negligible)
+    best = min((longer, quick), key=partial(_minimised, model))
+    if not enough <= _minimised(model, best) <= asked:
+        return best
+    afresh = fit_base(model, variables, frames, start, tolerance=ROUGH, negligible=negligible)
+    return min((best, afresh), key=partial(_minimised, model))

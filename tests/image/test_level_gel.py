@@ -48,9 +48,7 @@ def test_images_of_moved_lights_need_no_mesh(scene, values, monkeypatch, area, t
     assert np.abs(quick[0] - quick[2]).max() > 1e-3 * quick[0].max()
 
 
-@pytest.mark.parametrize(
-    "others", ({"gel.press_depth": 0.5}, {"gel.curve_xx": 2e-3}, {"gel.wedge_x": 1.0}), ids=str
-)
+@pytest.mark.parametrize("others", ({"gel.press_depth": 0.5}, {"gel.curve_xx": 2e-3}, {"gel.wedge_x": 1.0}), ids=str)
 def test_a_gel_that_is_not_level_may_shade_itself(scene, values, others):
     assert set(others) <= set(scene.parameters)
     renderer = Renderer(scene)

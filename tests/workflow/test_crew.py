@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from operator import methodcaller
 from types import SimpleNamespace
 
 import numpy as np
@@ -103,8 +104,13 @@ def test_who_keeps_all_cores_busy_alone_shares_no_press(monkeypatch, busy, press
     monkeypatch.setattr(crews, "Crew", lambda *given: begun.append(given) or SimpleNamespace(ready=lambda model: False))
     hands = crews.Hands()
     hands.spent, hands.worked = 2 * crews.START, busy * 2 * crews.START
-    assert hands._crew(SimpleNamespace(recipe=lambda: None, presses=presses), [0, 1]) is None
+    model = SimpleNamespace(recipe=lambda: None, presses=presses, renderer=SimpleNamespace(at_once=False))
+    assert hands._crew(model, [0, 1]) is None
     assert bool(begun) is begins
+    begun.clear()
+    model.renderer.at_once = True  # then one makes all frames of a press at once
+    assert hands._crew(model, [0, 1]) is None
+    assert bool(begun) is (presses == [0, 1])
 
 
 @pytest.fixture(scope="module")
@@ -133,7 +139,7 @@ def at_work(monkeypatch):
         monkeypatch.setattr(crews, "START", -1.0)
         monkeypatch.setattr(crews, "_allowed", 2)
         end = time.monotonic() + DEADLINE
-        while model.hands._crew(model, [0, 1]) is None:
+        while model.hands._crew(model, range(len(model.frames))) is None:
             assert not model.hands.alone and time.monotonic() < end
             time.sleep(0.05)
         began.append(model)
@@ -171,6 +177,37 @@ def test_the_numbers_are_those_of_one_process(setup, at_work):
     assert all(np.allclose(a, b, rtol=1e-6) for a, b in zip(one.predict(values), two.predict(values)))
     assert two.hands.alone and two.hands.crew is None
     assert two.companions == one.companions
+
+
+@pytest.mark.slow
+def test_jobs_of_one_press_are_shared(setup, at_work, monkeypatch):
+    """Whichever process takes them; what one leaves behind that dies is done by the other. A mistake is raised."""
+    model, press = at_work(open_model(setup)), [0, 1]
+    made = []
+    make = crews.Helper.make
+    monkeypatch.setattr(crews.Helper, "make", lambda *given: made.append(given) or make(*given))
+    values = [Values({"led_2.mu": 1.2 + 0.1 * k}) for k in range(8)]
+    alone = [model.predict(own, press) for own in values]
+    assert not made and model.hands.shares_jobs(model, press) and not model.hands.shares_jobs(model, range(6))
+
+    def check(found):
+        assert sorted(found) == list(range(8))
+        for k, images in found.items():
+            assert all(np.allclose(a, b, rtol=1e-6) for a, b in zip(images, alone[k]))
+
+    jobs = [methodcaller("predict", own, press) for own in values]
+    check(dict(model.each(press, jobs)))
+    assert 0 < len(made) < 8
+    with pytest.raises(ValueError, match="gel.press_depth = 'deep' is not a number"):
+        dict(model.each(press, [methodcaller("predict", Values({"gel.press_depth": "deep"}), press)] * 2))
+    assert model.hands.crew is not None and not model.hands.alone
+    found, crew = {}, model.hands.crew
+    for k, images in model.each(press, jobs):
+        if not found:
+            os.kill(crew.others[0].process.pid, signal.SIGKILL)
+        found[k] = images
+    check(found)
+    assert model.hands.alone and model.hands.crew is None
 
 
 @pytest.mark.slow
