@@ -63,7 +63,7 @@ def diagnose(
     *,
     fitted: Sequence[int],
     refit: Callable[..., Fit] | None = None,
-    foresee: Callable[..., None] | None = None,
+    foresee: Callable[[Sequence[Sequence[Variable]], Progress], None] | None = None,
     cooler: Callable[[Sequence[Fit]], Cooled | None] | None = None,
     negligible: float = COARSE,
     rows_max: int = 400_000,
@@ -83,8 +83,7 @@ def diagnose(
     variables_of  the variables that an effect frees; one per frame for the scope 'frame'
     held_out      frames that were not fitted; only what each frame has for itself is fitted there
     refit         `optics.fit.calibrate.fit` unless given; called as refit(model, variables, start, frames=[...])
-    foresee       called before refits, as foresee(sets, progress), with the variables of each effect that is refitted;
-                  with idly=True of pairs that may be refitted next, for processes that have nothing to do
+    foresee       called before the refits, with the variables of each effect that is refitted
     cooler        called with the refits, the best first. Where that one asks that priors count less than in the
                   base, and that may change the verdict, it returns what the diagnosis begins again from; else None
     negligible    share of what images leave beyond noise below which a promised fall is not worth another linearisation

@@ -62,7 +62,6 @@ from optics.fit.result import Fit
 from optics.scene.parameter import Values, Variable
 
 LARGEST = 3  # effects of one explanation
-AHEAD = 2  # pairs that are refitted at once, where there are processes for it: the second is seldom in vain
 LEADERS, FOLLOWERS = 3, 4  # explanations that are extended in each round, and effects that each is extended by
 REACH = 3 * CLEAR  # of the best score: an explanation that is expected to stay farther behind is not refitted
 LINEAR = 0.1  # relative difference of a refit's fall from the one expected, below which nothing is linearised again
@@ -663,8 +662,6 @@ def _joined(case: Case, trials: dict[frozenset[str], Trial]) -> list[frozenset[s
         if not wanted:
             break
         case.say("refit of pairs", n, pairs.REFITTED)
-        if case.foresee is not None:
-            case.foresee([[*a.variables, *b.variables] for a, b, _ in wanted[:AHEAD]], case.say, idly=True)
         a, b, linear = wanted[0]
         tried.add(names := _names(wanted[0]))
         try:

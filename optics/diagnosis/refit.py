@@ -50,7 +50,7 @@ class Cooled:
 
     base: Fit
     refit: Callable[..., Fit]
-    foresee: Callable[..., None]
+    foresee: Callable[[Sequence[Sequence[Variable]], Progress], None]
     remark: str
 
 
@@ -81,7 +81,7 @@ class Case:
     seed: int
     say: Progress
     places: list[dict[str, np.ndarray]] | None = None
-    foresee: Callable[..., None] | None = None
+    foresee: Callable[[Sequence[Sequence[Variable]], Progress], None] | None = None
     expected: Sequence[Expected] = ()
     negligible: float = COARSE
     over_dials: dict[tuple[frozenset[str], str], float] = field(default_factory=dict)

@@ -72,13 +72,10 @@ class Refits:
         excess = max(self.base.chi2 - count, 1.0)
         return COARSE * float(np.clip(shared / excess, 0.0, 1.0))
 
-    def foresee(
-        self, sets: Sequence[Sequence[Variable]], say: Callable[[str, int, int], None], idly: bool = False
-    ) -> None:
+    def foresee(self, sets: Sequence[Sequence[Variable]], say: Callable[[str, int, int], None]) -> None:
         """Chord steps of each set of variables, so that the best is known before any is calibrated; of one press, their
-        calibrations as well, in as many processes as there are. idly: only where one would have nothing to do."""
-        together = self.model.hands.shares_jobs(self.model, self.base.frames)
-        if not self.by_chords() or (idly and not together):
+        calibrations as well, in as many processes as there are."""
+        if not self.by_chords():
             return
         wanted = [extra for extra in sets if self.curved(extra) < 2 and not self._begun(extra)]
         say("chord steps", len(sets) - len(wanted), len(sets))
@@ -88,7 +85,7 @@ class Refits:
             if quick is not None:
                 self.chords[_names(wanted[k])] = self._as_ours(quick, wanted[k])
             say("chord steps", n, len(sets))
-        if together:
+        if self.model.hands.shares_jobs(self.model, self.base.frames):
             self._calibrate_ahead([extra for extra in wanted if _names(extra) in self.chords], say)
 
     def _calibrate_ahead(self, sets: Sequence[Sequence[Variable]], say: Callable[[str, int, int], None]) -> None:

@@ -102,14 +102,18 @@ def test_who_keeps_all_cores_busy_alone_shares_no_press(monkeypatch, busy, press
     monkeypatch.setattr(crews, "cores", lambda: 2)
     monkeypatch.setattr(crews, "_shares", lambda model: True)
     monkeypatch.setattr(crews, "Crew", lambda *given: begun.append(given) or SimpleNamespace(ready=lambda model: False))
-    hands = crews.Hands()
-    hands.spent, hands.worked = 2 * crews.START, busy * 2 * crews.START
+
+    def hands():
+        found = crews.Hands()
+        found.spent, found.worked = 2 * crews.START, busy * 2 * crews.START
+        return found
+
     model = SimpleNamespace(recipe=lambda: None, presses=presses, renderer=SimpleNamespace(at_once=False))
-    assert hands._crew(model, [0, 1]) is None
+    assert hands()._crew(model, [0, 1]) is None
     assert bool(begun) is begins
     begun.clear()
     model.renderer.at_once = True  # then one makes all frames of a press at once
-    assert hands._crew(model, [0, 1]) is None
+    assert hands()._crew(model, [0, 1]) is None
     assert bool(begun) is (presses == [0, 1])
 
 
@@ -199,7 +203,7 @@ def test_jobs_of_one_press_are_shared(setup, at_work, monkeypatch):
     check(dict(model.each(press, jobs)))
     assert 0 < len(made) < 8
     with pytest.raises(ValueError, match="gel.press_depth = 'deep' is not a number"):
-        dict(model.each(press, [methodcaller("predict", Values({"gel.press_depth": "deep"}), press)] * 2))
+        dict(model.each(press, [methodcaller("predict", Values({}, {0: {"gel.press_depth": "deep"}}), press)] * 2))
     assert model.hands.crew is not None and not model.hands.alone
     found, crew = {}, model.hands.crew
     for k, images in model.each(press, jobs):
