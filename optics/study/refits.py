@@ -179,7 +179,8 @@ class Refits:
             "quick": quick,
             "enough": before - AS_PROMISED * quick.promised,
             "asked": math.inf if quick.promised > near else before - near,
-            "start": off_neutral(self.model, Values(dict(self.setup.values)), extra),
+            "extra": extra,
+            "start": Values(dict(self.setup.values)),
             "negligible": self.coarse,
         }
 
@@ -320,7 +321,15 @@ def _chord(
     return calibrate.extended(model, base, extra, steps, seed=seed, negligible=negligible)
 
 
-def _calibrated(model: SceneModel, quick: Fit, enough: float, asked: float, start: Values, negligible: float) -> Fit:
+def _calibrated(
+    model: SceneModel,
+    quick: Fit,
+    enough: float,
+    asked: float,
+    extra: Sequence[Variable],
+    start: Values,
+    negligible: float,
+) -> Fit:
     """A calibration that continues chord steps; where that falls short of what was promised, one from the study's start
     values: a strong effect may have bent the base's values far from the truth. What was promised as much as the best is
     followed to its end, since where chord steps have stuck nothing more is promised.
@@ -332,5 +341,6 @@ def _calibrated(model: SceneModel, quick: Fit, enough: float, asked: float, star
     best = min((longer, quick), key=partial(_minimised, model))
     if not enough <= _minimised(model, best) <= asked:
         return best
-    afresh = fit_base(model, variables, frames, start, tolerance=ROUGH, negligible=negligible)
+    begun = off_neutral(model, start, extra)
+    afresh = fit_base(model, variables, frames, begun, tolerance=ROUGH, negligible=negligible)
     return min((best, afresh), key=partial(_minimised, model))
