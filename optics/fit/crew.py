@@ -21,6 +21,7 @@ from contextlib import suppress
 from functools import partial
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
+from threading import Lock
 from typing import TYPE_CHECKING, Any
 
 from optics.processes import cores, for_workers, free_memory, without_ctrl_c
@@ -162,6 +163,7 @@ class Crew:
 
     def run(self, model: SceneModel, frames: Sequence[int], task: Task) -> Iterator[Any]:
         """What a task makes of each frame, in their order. Raises Gone."""
+        self.take_part(model)
         self.share(frames)
         charges = [frozenset(f for f, own in self.charge.items() if own == k) for k in range(self.count)]
         model.take_charge(charges[0])
@@ -195,41 +197,45 @@ class Crew:
         Gone, and then puts back what was not done."""
         everything = frozenset(range(len(model.frames)))
         sent: dict[Future, tuple[int, Job]] = {}
-        going = True
+        lock, going = Lock(), True  # a job waits, was sent, or is being made here; never in between
 
         def send(other: Helper, last: Future | None = None) -> None:
-            if not going or last is not None and isinstance(last.exception(), Gone):
-                return
-            with suppress(IndexError):  # none waits
+            with lock:
+                if not (going and jobs) or last is not None and isinstance(last.exception(), Gone):
+                    return
                 n, job = jobs.popleft()
                 made = other.make(partial(_done, job=job), n, everything)
                 sent[made] = n, job
-                made.add_done_callback(partial(send, other))
+            made.add_done_callback(partial(send, other))
 
         model.take_charge(everything)
         self.take_part(model)
         try:
             for other in self.others:
                 send(other)
-            while jobs or sent:
-                if jobs:
-                    with suppress(IndexError):  # another process took it
-                        n, job = jobs.popleft()
-                        yield n, job(model)
+            while True:
+                with lock:
+                    own = jobs.popleft() if jobs else None
+                    others = list(sent)
+                if own is not None:
+                    yield own[0], own[1](model)
+                elif others:
+                    wait(others, return_when=FIRST_COMPLETED)
                 else:
-                    wait(list(sent), return_when=FIRST_COMPLETED)
-                for made in [made for made in list(sent) if made.done()]:
+                    break
+                for made in [made for made in others if made.done()]:
                     n, job = sent[made]
                     try:
                         found = made.result()
                     except Failed:
                         found = job(model)
-                    del sent[made]
+                    with lock:
+                        del sent[made]
                     yield n, found
         finally:
-            going = False
-            jobs.extend(sent.values())
-            _use_cores(1)
+            with lock:
+                going = False
+                jobs.extend(sent.values())
 
 
 def _done(model: SceneModel, number: int, job: Job) -> Any:
@@ -282,7 +288,9 @@ def _take_part(model: SceneModel, count: int) -> None:
 def _use_cores(count: int) -> None:
     import drjit as dr
 
-    dr.set_thread_count(max(cores() // count, 1))
+    threads = max(cores() // count, 1)
+    if dr.thread_count() != threads:
+        dr.set_thread_count(threads)
 
 
 def _end(others: Sequence[Helper]) -> None:
@@ -310,6 +318,9 @@ class Hands:
                     done += 1
             except Gone:
                 self.give_up(model)
+        elif self.crew is not None and self.crew.working:  # which has nothing to share
+            model.take_charge(frozenset(range(len(model.frames))))
+            _use_cores(1)
         for frame in frames[done:]:
             began, before = time.perf_counter(), time.process_time()
             made = task(model, frame)
@@ -342,8 +353,8 @@ class Hands:
     def shares_jobs(self, model: SceneModel, frames: Sequence[int]) -> bool:
         """Whether processes share jobs that ask for these frames: where they would have to share a press, which one
         renders as quickly."""
-        most = allowed()
-        if most < 2 or not _shares(model) or not model.renderer.at_once:
+        most = allowed() if self.crew is None else self.crew.count
+        if self.alone or most < 2 or not _shares(model) or not model.renderer.at_once:
             return False
         return _shared(model.presses, frames, most)
 
@@ -352,7 +363,10 @@ class Hands:
 
         Processes that share the frames of a press each move its geometry: where Dr.Jit keeps the cores busy, they take
         half as long again as one process (six LEDs of one press on two cores)."""
-        if len(frames) < 2 or self.shares_jobs(model, frames):
+        if len(frames) == 1:  # is made where its images are kept
+            if self.crew is None or frames[0] not in self.crew.charge:
+                return None
+        elif self.shares_jobs(model, frames):
             return None
         busy = self.crew is None and self.worked > BUSY * cores() * self.spent
         if busy and _shared(model.presses, frames, min(allowed(), len(frames))):

@@ -1189,7 +1189,7 @@ class Renderer:
         key = ("bounced", seed, samples, *self._led_key(values, led))
         if key in self._plain:
             return self._bounced(values, led, self._plain[key], component)
-        if self.hits(values).bare:  # a level skin does not meet itself, and windows mirror nothing back to it
+        if self.hits(values).bare and len(self._world().shapes()) == 1:  # a level skin does not meet itself
             return self._parts_of(np.zeros((self.height, self.width, self.bands), np.float32))
         self.apply(values)
         sample, numbers, met = self._spread(values, seed, samples)

@@ -339,7 +339,7 @@ def _calibrated(
     variables, frames = quick.variables, quick.frames
     longer = further(model, variables, quick.values, frames, asked=asked, negligible=negligible)
     best = min((longer, quick), key=partial(_minimised, model))
-    if not enough <= _minimised(model, best) <= asked:
+    if _minimised(model, best) < enough or _minimised(model, best) > asked:
         return best
     begun = off_neutral(model, start, extra)
     afresh = fit_base(model, variables, frames, begun, tolerance=ROUGH, negligible=negligible)

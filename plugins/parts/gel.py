@@ -353,6 +353,7 @@ def build():
             self.level = False  # whether all of the face lies in one plane across the camera's axis
             self.seen_touch = None  # of which a texture was made
             self.recalled = None  # another geometry than the mesh is in, as `recall` has it
+            self.deep = None  # its thickness, mm, Dr.Jit
             if self.indenter.lower().endswith(contact.FILES):
                 self.indenter = str(mi.file_resolver().resolve(self.indenter))
             params = mi.traverse(self)
@@ -519,8 +520,9 @@ def build():
             return s + (x + xx * p.x + xy * p.y) * p.x + (y + yy * p.y) * p.y
 
         def recall(self, values):
-            """Let `touched` answer for a geometry that the mesh has left: the gel's values by name; None: its own."""
+            """Let `touched` and `length_inside` answer for a geometry that the mesh has left: the gel's values by name; None: its own."""
             self.recalled = values
+            self.deep = None if values is None else dr.opaque(mi.Float, values["thickness"])
 
         def touched(self, p):
             """1 where the indenter touches the face at the point p, 0 elsewhere; Dr.Jit."""
@@ -542,8 +544,9 @@ def build():
         # -- the way of light in the gel ------------------------------------------------------------------------------
         def length_inside(self, p, q):
             """Length (mm) of the part of the segment p-q that lies in the gel, z > -thickness, for p inside."""
-            share = (p.z + self.thickness) / dr.maximum(p.z - q.z, 1e-6)
-            share = dr.select(q.z >= -self.thickness, 1.0, dr.clip(share, 0, 1))
+            thickness = self.thickness if self.deep is None else self.deep
+            share = (p.z + thickness) / dr.maximum(p.z - q.z, 1e-6)
+            share = dr.select(q.z >= -thickness, 1.0, dr.clip(share, 0, 1))
             # of light from all around p is q, where the norm has no derivative
             return dr.sqrt(dr.maximum(dr.squared_norm(q - p), 1e-12)) * share
 

@@ -25,7 +25,7 @@ def values(scene):
 @pytest.mark.parametrize("area", ({}, WITH_AREA), ids=("points", "discs"))
 @pytest.mark.parametrize("together", (False, True), ids=("apart", "together"))
 def test_images_of_moved_lights_need_no_mesh(scene, values, monkeypatch, area, together):
-    """The images, second reflections and derivatives are those with the mesh in its place, which stays away."""
+    """The images and their derivatives are those with the mesh in its place, which stays away."""
     values = {**values, **area}
     moved = {**values, "led_1.x": values["led_1.x"] + 1.0}
 
@@ -34,7 +34,7 @@ def test_images_of_moved_lights_need_no_mesh(scene, values, monkeypatch, area, t
         found = [renderer.image(values, light) for light in LIGHTS]
         renderer.apply({**values, "gel.press_depth": 0.6})
         for light in LIGHTS:
-            found += [renderer.image(moved, light), renderer.bounced(moved, light)]
+            found.append(renderer.image(moved, light))
             found += [renderer.led_tangent(moved, light, f"{light}.{name}") for name in ("x", "mu")]
         return found, scene.gel.number("press_depth")
 
@@ -58,3 +58,21 @@ def test_a_gel_that_is_not_level_may_shade_itself(scene, values, others):
 
 def test_a_rim_in_view_takes_finer_samples(scene, values):
     assert not Renderer(scene).hits({**values, "gel.width": 4.0}).bare
+
+
+def test_light_goes_through_the_gel_of_its_own_frame(scene, values):
+    """Its thickness acts on light and shapes the mesh: where that stands for another frame, it is not that one's."""
+    absorbing = {**values, "gel.absorption": 0.05, "gel.thickness": 4.0}
+    moved = {**absorbing, "led_1.x": values["led_1.x"] + 1.0}
+    renderer = Renderer(scene)
+    renderer.image(absorbing, "led_1")
+    renderer.image({**absorbing, "gel.thickness": 6.0}, "led_1")
+    assert np.allclose(renderer.image(moved, "led_1"), Renderer(scene).image(moved, "led_1"), rtol=1e-5)
+
+
+def test_what_a_window_sends_back_is_not_left_out(scene, values, monkeypatch):
+    """Haze before a window, by the second of two ways."""
+    hazy = {**values, "gel.haze": 0.03}
+    quick = Renderer(scene).bounced(hazy, "led_1")
+    monkeypatch.setattr(Renderer, "_bare", lambda *_: False)
+    assert np.allclose(quick, Renderer(scene).bounced(hazy, "led_1"), rtol=1e-5, atol=1e-9)
