@@ -520,7 +520,8 @@ def build():
             return s + (x + xx * p.x + xy * p.y) * p.x + (y + yy * p.y) * p.y
 
         def recall(self, values):
-            """Let `touched` and `length_inside` answer for a geometry that the mesh has left: the gel's values by name; None: its own."""
+            """Let `touched` and `length_inside` answer for another geometry than the mesh is in: the gel's values by
+            name; None: its own."""
             self.recalled = values
             self.deep = None if values is None else dr.opaque(mi.Float, values["thickness"])
 
