@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -79,7 +79,7 @@ class Refits:
             return
         wanted = [extra for extra in sets if self.curved(extra) < 2 and not self._begun(extra)]
         say("chord steps", len(sets) - len(wanted), len(sets))
-        jobs = [partial(_tried, make=partial(_chord, **self._chord_of(extra))) for extra in wanted]
+        jobs = [partial(_tried, make=partial(calibrate.extended, **self._chord_of(extra))) for extra in wanted]
         made = self.model.each(self.base.frames, jobs)
         for n, (k, quick) in enumerate(made, len(sets) - len(wanted) + 1):
             if quick is not None:
@@ -148,13 +148,13 @@ class Refits:
         """The fit by chord steps."""
         names = _names(extra)
         if names not in self.chords:
-            self.chords[names] = _chord(self.model, **self._chord_of(extra))
+            self.chords[names] = calibrate.extended(self.model, **self._chord_of(extra))
         return self.chords[names]
 
     def _chord_of(self, extra: Sequence[Variable]) -> dict[str, Any]:
-        """What `_chord` needs beside the model."""
+        """What chord steps need beside the model."""
         steps = {v.name: self.steps[v.name] for v in extra if v.name in self.steps}
-        return {"base": self.base, "extra": extra, "steps": steps, "seed": self.setup.seed, "negligible": self.coarse}
+        return {"base": self.base, "extra": extra, "secant": steps, "seed": self.setup.seed, "negligible": self.coarse}
 
     def leader(self) -> float:
         """The best fall so far."""
@@ -313,12 +313,6 @@ def _tried(model: SceneModel, make: Callable[[SceneModel], Fit]) -> Fit | None:
 
 def _minimised(model: SceneModel, found: Fit) -> float:
     return found.chi2 + prior_terms(model, found.variables, found.values)[2]
-
-
-def _chord(
-    model: SceneModel, base: Fit, extra: Sequence[Variable], steps: Mapping[str, float], seed: int, negligible: float
-) -> Fit:
-    return calibrate.extended(model, base, extra, steps, seed=seed, negligible=negligible)
 
 
 def _calibrated(
