@@ -28,7 +28,8 @@ import csv
 import json
 import math
 import os
-from collections.abc import Callable, Sequence
+import shutil
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -862,12 +863,22 @@ def comment(text: str) -> str:
 
 
 def write_set(
-    folder: Path, frames, noise, flat, xml: str, facts: dict, bits: int | None, overwrite: bool, text: str = ""
+    folder: Path,
+    frames,
+    noise,
+    flat,
+    xml: str,
+    facts: dict,
+    bits: int | None,
+    overwrite: bool,
+    text: str = "",
+    files: Mapping[str, Path] | None = None,
 ) -> Path:
-    """flat: one for all frames, None where each has its own; text: of README.txt, that of presses without it."""
+    """flat: one for all frames, None where each has its own; text: of README.txt, that of presses without it; files: of
+    names in the folder that settings name, the files to copy there."""
     folder = Path(os.path.abspath(folder))
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        ours = {*EXTRAS, "captures.toml", "frames", "flat"}
+        ours = {*EXTRAS, "captures.toml", "frames", "flat", "heights"}
         names = [p.name for p in folder.glob("*")] if folder.is_dir() else []
         extra = [name for name in names if name not in ours and not name.startswith("flat_field.")]
         if not overwrite or extra or not (folder / "import.json").is_file():
@@ -882,6 +893,9 @@ def write_set(
         (temporary / "scene.xml").write_text(xml, encoding="utf-8")
         (temporary / "import.json").write_text(json.dumps(facts, indent=1), encoding="utf-8")
         (temporary / "README.txt").write_text(text or readme(facts), encoding="utf-8")
+        for name, file in (files or {}).items():
+            (temporary / name).parent.mkdir(exist_ok=True)
+            shutil.copyfile(file, temporary / name)
     return folder
 
 

@@ -7,6 +7,10 @@ are annotated with their places in the grid (`GridCircle`: x, y in px, gx, gy), 
 goes out is what `optics.captures.importing` writes, with a frame for each scan and LED: its flat field is that of its
 LED, its settings say which LED is on and where the plate is pressed.
 
+A scan of something else has a shape where a map of heights lies beside it (`heightmap.tmd`), and is imported where
+`mapped` names it: the map presses the gel over all of the view. Its frames are there to be predicted: whoever derived
+the map had these images, so that the advice is to hold them out.
+
 Derived, not measured, and said so:
     plate      the similarity that maps (gx, gy) to (x, y): `gel.press_x`, `gel.press_y` of the ball nearest the middle
                and `gel.press_rz`; it is compared with `calibspacing` and `mmperpixel`
@@ -44,14 +48,16 @@ from optics.captures.corrections import (
 from optics.captures.importing import Imported, comment, filled, noise_of_levels, write_set
 from optics.captures.noise import Noise
 from optics.captures.skin_motion import SkinMotion, skin_motion
-from optics.errors import BadCapture
+from optics.errors import BadCapture, UnknownKey
 from optics.files import yaml_checks
+from optics.files.heights import read_tmd
 from optics.files.images import read_image, varied
 from optics.files.output import shipped
 from optics.files.yaml_checks import short
 from optics.skin.contact import STRETCH
 
-FILE = "scan.yaml"
+FILE, HEIGHTS = "scan.yaml", "heightmap.tmd"
+MAPS = "heights"  # folder of a capture set
 LEDS = 64  # images of one scan
 SMALLEST, ACROSS = 5.0, 200  # px of a ball's radius at least, and how many of them are across an image at most
 DISTANCE = 30.0  # mm from the middle of the face to a light, where no better is known
@@ -76,6 +82,7 @@ MESH, MAP = 16, 30
 # grid by .009 to .012 (rms), two of them differ by sqrt 2 times that: this is six times as much.
 SAME = 0.1
 ALIKE = 0.01  # relative: scales that differ by more are a contradiction
+COVERED = 0.02  # relative: a map of heights has the size of the image to within this
 POSE = ("gel.press_x", "gel.press_y", "gel.press_depth", "gel.press_rx", "gel.press_ry", "gel.press_rz")
 
 
@@ -83,7 +90,8 @@ POSE = ("gel.press_x", "gel.press_y", "gel.press_depth", "gel.press_rx", "gel.pr
 class Scan:
     """images (N, H, W, 1) DN, one for each LED;   circles (B, 4): x, y in px from the first pixel's middle, gx, gy
 
-    radius, spacing in mm and mm per pixel, as annotated; 0 where nothing is pressed"""
+    radius, spacing in mm and mm per pixel, as annotated; 0 where nothing is pressed
+    heights: the file with a map of what is pressed, of a scan without circles"""
 
     name: str
     labels: list[str]
@@ -93,6 +101,18 @@ class Scan:
     spacing: float
     mm_per_pixel: float
     remarks: Sequence[str] = ()
+    heights: Path | None = None
+
+
+@dataclass(frozen=True)
+class Scans:
+    """What a folder of scans holds: those of pressed plates, those that a map of heights presses, the flat field, and
+    in words those that are not used."""
+
+    plates: list[Scan]
+    mapped: list[Scan]
+    flat: Scan
+    unused: list[str]
 
 
 @dataclass(frozen=True)
@@ -158,7 +178,9 @@ def read_scan(folder: Path) -> Scan:
         if _of(a, "type") == "GridCircle"
     ]
     if not circles:
-        return Scan(folder.name, labels, np.stack(images), np.zeros((0, 4)), 0.0, 0.0, 0.0)
+        heights = folder / HEIGHTS
+        scan = Scan(folder.name, labels, np.stack(images), np.zeros((0, 4)), 0.0, 0.0, 0.0)
+        return replace(scan, heights=heights) if heights.is_file() else scan
     radius, spacing, scale = (
         yaml_checks.number(data, key, file, 1e-6, 1e3) for key in ("calibradius", "calibspacing", "mmperpixel")
     )
@@ -217,8 +239,10 @@ def _merged(circles: np.ndarray, radius: float, where: str, scan: str) -> tuple[
     return merged, [f"{scan}: {balls} annotated more than once: the mean of the circles is used"] * bool(again)
 
 
-def scans_in(source: Path) -> tuple[list[Scan], Scan, list[str]]:
-    """(scans of pressed plates, the flat field, names of those that are not used) of a folder of scan folders."""
+def scans_in(source: Path, mapped: Sequence[str] = ()) -> Scans:
+    """The scans of a folder of scan folders; `mapped` names those that a map of heights is to press.
+
+    Raises BadCapture; UnknownKey for a name that no scan has."""
     if not source.is_dir():
         raise BadCapture(f"{source}: no such folder; give a folder that holds scan folders")
     if (source / FILE).is_file():
@@ -226,23 +250,71 @@ def scans_in(source: Path) -> tuple[list[Scan], Scan, list[str]]:
     folders = sorted(p.parent for p in source.glob(f"*/{FILE}"))
     if not folders:
         raise BadCapture(f"{source}: holds no folder with a {FILE}; allowed: scans of pressed balls and a flat field")
+    for name in mapped:
+        if name not in (names := [folder.name for folder in folders]):
+            raise UnknownKey(name, names, "scan", str(source))
     scans = [read_scan(folder) for folder in folders]
-    pressed, empty = [s for s in scans if len(s.circles)], [s for s in scans if not len(s.circles)]
-    if not pressed:
+    plates, others = [s for s in scans if len(s.circles)], [s for s in scans if not len(s.circles)]
+    if not plates:
         raise BadCapture(f"{source}: no scan has annotations of type GridCircle; needed: one of pressed balls or more")
-    first = pressed[0]
-    alike = [s for s in empty if s.images.shape == first.images.shape and s.labels == first.labels]
-    flats = [s for s in alike if "flat" in s.name.lower()] or alike
+    first = plates[0]
+    taken = [s for s in scans if s.name in mapped]
+    for scan in taken:
+        _check_map(source, scan, first)
+    alike = [s for s in others if _same_bench(s, first)]
+    flats = [s for s in alike if "flat" in s.name.lower()] or [s for s in alike if s.heights is None] or alike
+    flats = [s for s in flats if s.name not in mapped]
     if not flats:
-        have = ", ".join(f"{s.name} {s.images.shape[2]} x {s.images.shape[1]} px" for s in empty) or "none"
+        have = ", ".join(f"{s.name} {s.images.shape[2]} x {s.images.shape[1]} px" for s in others) or "none"
         raise BadCapture(
             f"{source}: no flat field for {first.name} ({first.images.shape[2]} x {first.images.shape[1]} px, LEDs "
             f"{', '.join(first.labels)}): scans without circles: {have}; needed: one of nothing pressed, with the same "
             "camera and LEDs"
         )
-    used = [s for s in pressed if s.images.shape == first.images.shape and s.labels == first.labels]
-    left = [s.name for s in scans if s is not flats[0] and not any(s is u for u in used)]
-    return used, flats[0], left
+    used = [s for s in plates if _same_bench(s, first)]
+    left = [s for s in scans if s is not flats[0] and not any(s is u for u in (*used, *taken))]
+    return Scans(used, taken, flats[0], _unused(left, first))
+
+
+def _same_bench(scan: Scan, first: Scan) -> bool:
+    """Whether two scans are of one camera and the same LEDs."""
+    return scan.images.shape == first.images.shape and scan.labels == first.labels
+
+
+def _check_map(source: Path, scan: Scan, first: Scan) -> None:
+    """Raises BadCapture where a map of heights cannot press the gel of the plates' bench."""
+    where = f"{source / scan.name / HEIGHTS}"
+    if len(scan.circles):
+        raise BadCapture(f"{source / scan.name}: its {FILE} has circles: it is imported as a plate of balls")
+    if scan.heights is None:
+        raise BadCapture(f"{where}: no such file; needed: a map of the heights that were pressed")
+    if not _same_bench(scan, first):
+        raise BadCapture(
+            f"{source / scan.name}: {scan.images.shape[2]} x {scan.images.shape[1]} px, LEDs {', '.join(scan.labels)}; "
+            f"allowed: those of {first.name}, {first.images.shape[2]} x {first.images.shape[1]} px, LEDs "
+            f"{', '.join(first.labels)}"
+        )
+    heights, steps = read_tmd(scan.heights, where)
+    has = [step * count for step, count in zip(steps, heights.shape[::-1])]
+    wanted = [count * first.mm_per_pixel for count in first.images.shape[2:0:-1]]
+    if any(abs(own / seen - 1) > COVERED for own, seen in zip(has, wanted)):
+        raise BadCapture(
+            f"{where}: {has[0]:.4g} x {has[1]:.4g} mm, but the image shows {wanted[0]:.4g} x {wanted[1]:.4g} mm; "
+            f"allowed: a map of all of the image, to within {COVERED:.0%}"
+        )
+
+
+def _unused(left: Sequence[Scan], first: Scan) -> list[str]:
+    """Which scans are not used, and why, in sentences."""
+    shaped = [s.name for s in left if s.heights is not None and _same_bench(s, first)]
+    others = [s.name for s in left if s.name not in shaped]
+    found = []
+    if others:
+        found.append(f"not used: {', '.join(others)} (another camera or other LEDs, or nothing pressed)")
+    if shaped:
+        options = " ".join(f"--heightmap {name}" for name in shaped)
+        found.append(f"not used: {', '.join(shaped)} (no balls); '{options}' takes the shape from {HEIGHTS}")
+    return found
 
 
 # -- deriving --------------------------------------------------------------------------------------------------------
@@ -368,25 +440,28 @@ def import_scans(
     *,
     bin: int = 4,
     saturation: float = 255.0,
+    mapped: Sequence[str] = (),
     overwrite: bool = False,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> Imported:
     """Write scans of pressed plates as a capture set with its scene; see the module's text for what is derived.
 
-    bin   pixels per side that are averaged into one; rows and columns that fill no block are left out, as many on
-          both sides. Raises BadCapture, OutputExists."""
+    bin      pixels per side that are averaged into one; rows and columns that fill no block are left out, as many on
+             both sides
+    mapped   names of further scans, whose maps of heights press the gel
+
+    Raises BadCapture, OutputExists; UnknownKey for a name that no scan has."""
     tick = progress or (lambda *_: None)
-    scans, flat, left = scans_in(Path(source))
+    read = scans_in(Path(source), mapped)
+    scans, flat = read.plates, read.flat
     first = scans[0]
     height, width = first.images.shape[1:3]
     if not 1 <= int(bin) == bin <= min(height, width) // 32:
         raise BadCapture(f"{source}: bin = {bin}; allowed: whole numbers from 1 to {min(height, width) // 32}")
-    scale, warnings = first.mm_per_pixel * bin, []
-    if left:
-        warnings.append(f"not used: {', '.join(left)} (another camera or other LEDs, or nothing pressed)")
+    scale, warnings = first.mm_per_pixel * bin, list(read.unused)
     steps = len(scans) + 1
     tick("import", 0, steps)
-    black = black_levels([i for s in (*scans, flat) for i in s.images])
+    black = black_levels([i for s in (*scans, *read.mapped, flat) for i in s.images])
     flats = np.stack([filled(i, bin, saturation, black)[..., 0] for i in flat.images])
     plates, cut, settings, motions = [], [], [], {}
     for done, scan in enumerate(scans, 1):
@@ -413,6 +488,15 @@ def import_scans(
     lights = _lights(scans, ratios, offsets, distances)
     for pose, *shown in zip(settings, scans, ratios, offsets):
         pose["gel.press_depth"] = round(_depth(*shown, lights), 6)
+    for scan in read.mapped:
+        settings.append(_mapped_pose(scan))
+        warnings.append(
+            f"{scan.name}: pressed by {HEIGHTS}, which was derived from images: '--hold-out {scan.name}' keeps it out "
+            "of the fit"
+        )
+    if read.mapped:  # what presses is a setting of each frame then
+        for pose in settings[: len(scans)]:
+            pose |= {"gel.indenter": "balls", "gel.indenter_size": first.radius}
     frames, masked, dark, drift = [], [], [], []
     for scan, images, ratio, offset, pose in zip(scans, cut, ratios, offsets, settings):
         for k, label in enumerate(scan.labels):
@@ -420,17 +504,15 @@ def import_scans(
             sd = noise.sd(flats[k]) * math.sqrt(2) / np.maximum(flats[k], 1.0)
             off = blemishes(ratio[k], sd, offset, scan.radius)
             masked.append(float(off.mean()))
-            lost = at_black(images[k][..., None], black)[..., 0] | at_black(flats[k][..., None], black)[..., 0]
+            lost = _cut_off(images[k], flats[k], black)
             dark.append(float(lost.mean()))
             level_face = np.hypot(*np.moveaxis(offset, -1, 0)) > NEAR * scan.radius
             drift.append(float(np.median(ratio[k][level_face & ~lost])))
-            off = off | lost
-            on = {f"led_{other}.power": float(other == label) for other in scan.labels}
-            frame = Frame(
-                f"{scan.name}_{label}", images[k][..., None].astype(np.float32), ~off, scan.name, {**pose, **on}
-            )
-            frame.flat_field = flats[k][..., None].astype(np.float32)
-            frames.append(frame)
+            frames.append(_frame(scan, label, images[k], flats[k], ~(off | lost), pose))
+    for scan, pose in zip(read.mapped, settings[len(scans) :]):
+        for label, whole, level in zip(scan.labels, scan.images, flats):
+            image = filled(whole, bin, saturation, black)[..., 0]
+            frames.append(_frame(scan, label, image, level, ~_cut_off(image, level, black), pose))
     if max(masked) > 0:
         warnings.append(
             f"dust, hair or glints: {100 * float(np.mean(masked)):.2g} % of the values are masked, up to "
@@ -444,7 +526,7 @@ def import_scans(
     remark = drift_text(np.array(drift)[:, None], [f.name for f in frames])
     if remark:
         warnings.append(f"{remark}; left as it is: light that the balls throw on the level face looks the same")
-    if motions and len(motions) < len(scans):
+    if motions and len(motions) < len(settings):
         for pose in settings:  # a column of all frames or of none
             pose |= {f"gel.{key}": pose.get(f"gel.{key}", 0.0) for key in STRETCH}
     facts = _facts(source, scans, flat, plates, motions, bin, scale, shape, noise, lights, warnings)
@@ -459,9 +541,32 @@ def import_scans(
         bits=None,
         overwrite=overwrite,
         text=readme(facts),
+        files={settings["gel.indenter"]: scan.heights for scan, settings in zip(read.mapped, settings[len(scans) :])},
     )
     tick("import", steps, steps)
     return Imported(path, warnings, facts)
+
+
+def _mapped_pose(scan: Scan) -> dict[str, float | str]:
+    """Settings with which a map of heights presses the gel: its middle in the middle of the image, and so deep that all
+    of it touches."""
+    heights, _ = read_tmd(scan.heights, str(scan.heights))
+    pose: dict[str, float | str] = dict.fromkeys(POSE, 0.0)
+    deep = math.ceil(1e3 * float(np.ptp(heights))) / 1e3
+    return pose | {"gel.press_depth": deep, "gel.indenter": f"{MAPS}/{scan.name}.tmd", "gel.indenter_size": 1.0}
+
+
+def _cut_off(image: np.ndarray, flat: np.ndarray, black: np.ndarray) -> np.ndarray:
+    """(H, W) bool: where image or flat field are cut off below."""
+    return at_black(image[..., None], black)[..., 0] | at_black(flat[..., None], black)[..., 0]
+
+
+def _frame(scan: Scan, label: str, image: np.ndarray, flat: np.ndarray, mask: np.ndarray, pose: Mapping) -> Frame:
+    """The frame of a scan under one LED."""
+    on = {f"led_{other}.power": float(other == label) for other in scan.labels}
+    frame = Frame(f"{scan.name}_{label}", image[..., None].astype(np.float32), mask, scan.name, {**pose, **on})
+    frame.flat_field = flat[..., None].astype(np.float32)
+    return frame
 
 
 def _corrections(bin: int, masked: Sequence[float]) -> list[dict[str, str]]:

@@ -82,9 +82,26 @@ def import_(
     leds: Annotated[
         int | None, typer.Option("--leds", help="LEDs of the scene to start from: 3 or 6.", show_default="3")
     ] = None,
-    bin: Annotated[int, typer.Option("--bin", min=1, help="Average blocks of this many pixels each way.")] = 1,
+    bin: Annotated[
+        int | None,
+        typer.Option(
+            "--bin",
+            min=1,
+            help="Average blocks of this many pixels each way.",
+            show_default="4 for scans, else 1",
+        ),
+    ] = None,
     every: Annotated[
         int | None, typer.Option("--every", min=1, help="Take every n-th press.", show_default="1")
+    ] = None,
+    heightmap: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--heightmap",
+            metavar="SCAN",
+            help="Of a folder of scans: also take this one, into which no balls are pressed, in the shape that its "
+            "heightmap.tmd says. Repeatable.",
+        ),
     ] = None,
     mosaic: Annotated[
         str | None,
@@ -163,15 +180,18 @@ def import_(
         "--background": background,
     }
     of_presses = [name for name, value in presses.items() if value is not None]
+    blocks = {} if bin is None else {"bin": bin}
     shared: dict[str, Any] = {
         "settings": listed,
         "bits": bits,
-        "bin": bin,
+        **blocks,
         "black_level": black_level or 0.0,
         "system_gain": system_gain,
         "dark_noise": dark_noise,
         "overwrite": force,
     }
+    if heightmap and (mosaic is not None or not scans.is_scan_source(source)):
+        raise ValueError(f"--heightmap: for folders of scans ({scans.FILE}) only, and {source} is none; leave it out")
     if mosaic is None and hyperspectral.is_cube_source(source):
         if of_presses:
             raise ValueError(f"{', '.join(of_presses)}: not of hyperspectral images; leave these out")
@@ -208,7 +228,9 @@ def import_(
         if of_presses:
             raise ValueError(f"{', '.join(of_presses)}: scan.yaml says so; leave these out")
         with terminal.progress() as progress:
-            found = scans.import_scans(source, output, bin=bin, overwrite=force, progress=progress)
+            found = scans.import_scans(
+                source, output, mapped=heightmap or (), **blocks, overwrite=force, progress=progress
+            )
         _tell(found.folder, found.warnings, found.facts["corrections"])
         return
     stated: dict[str, Any] = {name: value for name, value in lengths.items() if value is not None}
@@ -217,11 +239,11 @@ def import_(
             raise ValueError(f"{', '.join(given)}: the folder's images say so; leave these out")
         with terminal.progress() as progress:
             found = translucent.import_translucent(
-                source, output, bin=bin, overwrite=force, progress=progress, **stated
+                source, output, **blocks, overwrite=force, progress=progress, **stated
             )
         _tell(found.folder, found.warnings, found.facts["corrections"])
         return
-    options: dict[str, Any] = {"leds": leds or 3, "bin": bin, "every": every or 1, "overwrite": force, **stated}
+    options: dict[str, Any] = {"leds": leds or 3, **blocks, "every": every or 1, "overwrite": force, **stated}
     if background is not None:
         options["background"] = background
     if source.suffix == ".npz" or importing.is_pack(source):

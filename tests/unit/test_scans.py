@@ -2,6 +2,8 @@
 numpy, and what it refuses."""
 
 import json
+import shutil
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +12,12 @@ import yaml
 from PIL import Image
 
 from optics.captures import capture_set, scans
-from optics.errors import BadCapture
+from optics.errors import BadCapture, UnknownKey
+from optics.files.heights import TMD
 from optics.light.rendering import RenderJob
 from optics.scene import loader
-from optics.study.setup import setup_for
+from optics.scene.parameter import Values
+from optics.study.setup import open_model, setup_for
 
 HEIGHT, WIDTH, SCALE = 384, 512, 0.012  # px, px, mm/px
 RADIUS, SPACING = 0.25, 1.0
@@ -245,6 +249,69 @@ def test_measured_scans_are_read(tmp_path):
     for plate in found.facts["scans"].values():
         assert plate["spacing_mm"] == pytest.approx(1, abs=2e-3) and plate["circles_off_rms_mm"] < 5e-3
     assert any("not used: groove" in w for w in found.warnings)
+
+
+def write_map(file, heights, scale=SCALE):
+    rows, columns = heights.shape
+    sizes = struct.pack("<IIffff", columns, rows, columns * scale, rows * scale, 0.0, 0.0)
+    file.write_bytes(TMD + b"\0" + sizes + heights.astype("<f4").tobytes())
+
+
+def hill():
+    """Heights (HEIGHT, WIDTH) in mm of a hill that stands right of the middle and above it, wider than high."""
+    v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
+    x, y = (u - WIDTH / 2) * SCALE, (v - HEIGHT / 2) * SCALE
+    return 0.12 * np.exp(-((x - 1.0) ** 2) / 0.5 - (y + 0.7) ** 2 / 0.25) - 0.3
+
+
+@pytest.fixture(scope="module")
+def shaped(tmp_path_factory):
+    """A plate of balls, the flat field, and a coin with its map."""
+    path, rng = tmp_path_factory.mktemp("shaped"), np.random.default_rng(6)
+    write_scan(path / "balls", middles(0.13, -0.21, 2.0), rng)
+    for name in ("coin", "flat"):
+        write_scan(path / name, {}, rng, annotated=False)
+    write_map(path / "coin" / "heightmap.tmd", hill())
+    return path
+
+
+def test_a_map_of_heights_presses_the_gel_where_it_is_asked_for(shaped, tmp_path):
+    unused = scans.scans_in(shaped).unused
+    assert unused == ["not used: coin (no balls); '--heightmap coin' takes the shape from heightmap.tmd"]
+    earlier = tmp_path / "captures" / "heights"
+    earlier.mkdir(parents=True)
+    for file in (earlier / "stamp.tmd", earlier.parent / "import.json"):
+        file.write_text("")
+    found = scans.import_scans(shaped, earlier.parent, bin=8, mapped=["coin"], overwrite=True)
+    assert [f.name for f in earlier.iterdir()] == ["coin.tmd"]
+    assert any("'--hold-out coin' keeps it out of the fit" in w for w in found.warnings)
+    model = open_model(setup_for(found.folder))
+    groups = [f.group for f in model.frames]
+    assert groups == ["balls"] * 3 + ["coin"] * 3
+    position = model.renderer.hits(model.at(Values(), groups.index("coin"))).position
+    expected = hill().reshape(HEIGHT // 8, 8, WIDTH // 8, 8).mean((1, 3))
+    # means of 8 samples along a slope of .2 and ends of facets: 1 um; a pixel's ray meets the face aside of its middle
+    # by a thousandth of its height
+    assert position[..., 2] == pytest.approx(expected.min() - expected, abs=3e-3)
+    assert np.ptp(position[..., 2]) == pytest.approx(np.ptp(expected), rel=0.02)
+
+
+@pytest.mark.parametrize(
+    "name, message",
+    [
+        ("cion", "cion"),
+        ("balls", "has circles: it is imported as a plate of balls"),
+        ("flat", "flat/heightmap.tmd: no such file"),
+        ("small", "3.072 x 2.304 mm, but the image shows 6.144 x 4.608 mm"),
+    ],
+)
+def test_a_map_that_cannot_be_used_is_refused(shaped, tmp_path, name, message):
+    shutil.copytree(shaped, tmp_path / "scans")
+    shutil.copytree(shaped / "coin", tmp_path / "scans" / "small")
+    write_map(tmp_path / "scans" / "small" / "heightmap.tmd", hill(), SCALE / 2)
+    with pytest.raises((BadCapture, UnknownKey)) as error:
+        scans.import_scans(tmp_path / "scans", tmp_path / "out", bin=8, mapped=[name])
+    assert message in str(error.value)
 
 
 def test_a_prior_of_the_user_leaves_the_other_advised_ones(tmp_path):

@@ -101,7 +101,8 @@ def test_two_presses_of_a_real_skin_stretch_it_alike(tmp_path):
     its rim, and alike within 3 %."""
     from optics.captures.scans import plate_of, scans_in
 
-    scans, flat, _ = scans_in(SCANS)
+    read = scans_in(SCANS)
+    scans, flat = read.plates, read.flat
     found = []
     for scan in scans:
         plate = plate_of(scan)
