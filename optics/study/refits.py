@@ -73,8 +73,9 @@ class Refits:
         return COARSE * float(np.clip(shared / excess, 0.0, 1.0))
 
     def foresee(self, sets: Sequence[Sequence[Variable]], say: Callable[[str, int, int], None]) -> None:
-        """Chord steps of each set of variables, so that the best is known before any is calibrated; of one press, their
-        calibrations as well, in as many processes as there are."""
+        """Chord steps of each set of variables, and the calibrations that these call for. All are held against the best
+        of the chord steps, so that what is followed does not depend on how many processes make them, or in what
+        order."""
         if not self.by_chords():
             return
         wanted = [extra for extra in sets if self.curved(extra) < 2 and not self._begun(extra)]
@@ -85,11 +86,10 @@ class Refits:
             if quick is not None:
                 self.chords[_names(wanted[k])] = self._as_ours(quick, wanted[k])
             say("chord steps", n, len(sets))
-        if self.model.hands.shares_jobs(self.model, self.base.frames):
-            self._calibrate_ahead([extra for extra in wanted if _names(extra) in self.chords], say)
+        self._calibrate_ahead([extra for extra in wanted if _names(extra) in self.chords], say)
 
     def _calibrate_ahead(self, sets: Sequence[Sequence[Variable]], say: Callable[[str, int, int], None]) -> None:
-        """The calibrations that chord steps call for, several at once."""
+        """The calibrations that chord steps call for, several at once where processes share them."""
         leader = self.leader() if sets else 0.0
         open_ = [extra for extra in sets if self.unfinished(self.chords[_names(extra)], leader)]
         jobs = [partial(_tried, make=partial(_calibrated, **self._calibrated_of(extra, leader))) for extra in open_]

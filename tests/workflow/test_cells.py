@@ -19,6 +19,7 @@ from optics.scene import loader
 from optics.scene.parameter import Parameter, Values, Variable
 from optics.study import cells as cells_of_studies
 from optics.study import loop
+from optics.study import refits as refits_of_studies
 from optics.study.cells import Cells
 from optics.study.refits import Refits
 from optics.study.setup import Setup
@@ -149,6 +150,41 @@ def test_chord_steps_that_stopped_short_of_a_promise_are_calibrated(monkeypatch,
     monkeypatch.setattr(calibrate, "fit", lambda *_, **__: whole)
     found = refits.of(model, [known, extra], Values(), [0])
     assert (found.reason == "converged") == calibrated and found.chi2 == (40.0 if calibrated else 84.0)
+
+
+def test_how_far_refits_are_followed_does_not_depend_on_what_was_made_first(monkeypatch):
+    """A calibration brings the best from 60 to 90. A rival that chord steps brought to 50, near 60 but not near 90, is
+    calibrated too, as where another process makes it meanwhile."""
+    p = Parameter("a", "1", 0.0, (-1.0, 1.0), "a number", plausible=1.0)
+    known, best, rival = (Variable(name, (f"m.{name}",), p) for name in "abc")
+    base = Fit(Values(), [known], np.zeros(1), np.eye(1), 100.0, 8, [0], [100.0], [9], True, "")
+    base.normal = object()  # chord steps are possible
+    after = {"b": 40.0, "c": 50.0}
+
+    def extended(model, extra, **_):
+        chi2 = after[extra[0].name]
+        return replace(base, variables=[known, *extra], chi2=chi2, promised=100.0 - chi2, converged=False)
+
+    def in_turn(frames, jobs):
+        return ((n, job(model)) for n, job in enumerate(jobs))
+
+    model = SimpleNamespace(captures=SimpleNamespace(table=None), parameters={"m.a": p, "m.b": p, "m.c": p})
+    model.each = in_turn
+    asked = []
+
+    def calibrated(model, quick, **_):
+        asked.append(quick.variables[1].name)
+        return replace(quick, chi2=10.0 if asked[-1] == "b" else quick.chi2, converged=True)
+
+    monkeypatch.setattr(calibrate, "extended", extended)
+    monkeypatch.setattr(refits_of_studies, "_calibrated", calibrated)
+    refits = Refits(model, Setup("captures"), base, [])
+    refits.coarse = 0.01
+    refits.foresee([[best], [rival]], lambda *_: None)
+    assert asked == ["b", "c"]
+    for extra in (best, rival):
+        refits.of(model, [known, extra], Values(), [0])
+    assert asked == ["b", "c"]  # and not again
 
 
 def touched(folder, hidden, strength):
