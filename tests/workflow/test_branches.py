@@ -64,7 +64,7 @@ def begun(tmp_path, seed, **options):
     return loop.begin(setup, tmp_path / "study")
 
 
-@pytest.mark.parametrize("seed", [1, 3])
+@pytest.mark.parametrize("seed", [pytest.param(1, marks=pytest.mark.slow), 3])
 def test_each_photograph_finds_its_side_of_the_extinction(mitsuba, tmp_path, seed):
     """The brightness of each is the same on both sides; left on the sides that they began on, the first set
     ends with a lamp of 87 +- 16 where 380 is right."""
@@ -74,6 +74,7 @@ def test_each_photograph_finds_its_side_of_the_extinction(mitsuba, tmp_path, see
     assert d.word == "NOTHING", d.sentence
 
 
+@pytest.mark.slow
 def test_errors_that_nobody_states_are_found_where_all_is_dark_by_what_is_written_down(mitsuba, tmp_path):
     """Of seven settings of each of two dials, seven sums are known: their width to 1/sqrt(14)."""
     study, model, fit = begun(tmp_path, 3, stated="")

@@ -139,6 +139,26 @@ def test_the_maker_and_the_model_are_two_accounts_of_one_grid():
         assert np.mean((radiance - stock) ** 2) < 1.3 * np.mean(error**2 + own**2)
 
 
+def test_absorption_hidden_in_a_small_grid_is_named(mitsuba, tmp_path):
+    """Two distances in 9 x 12 px, and of the effects those that come nearest: half a minute.
+
+    The maker's own error is .32 of the camera's noise, which makes chi2 1.10 per value."""
+    strength, tested = 0.4, ("body absorption", "volume scattering", "rough walls", "dark offset", "gain drift")
+    maker = small({"body absorption": strength}, seed=5, spp=1200)
+    capture_files.write(maker.captures([2.5, 4.0]), tmp_path / "captures", bits=8)
+    chance = {"rays": "512", "packets": "10000"}
+    setup = loop.Setup(str(tmp_path / "captures"), chance, free=FREE, per_group=[], held_out=HELD)
+    study, model, fit = loop.begin(setup, tmp_path / "study")
+    without = [e.name for e in loop.candidates(model, study) if e.name not in tested]
+    d = loop.examine(study, model, setup, fit, advised=False, without=without)
+    assert len(d.rows) == len(tested)
+    assert d.word == "CLAIM" and d.missing == "body absorption", d.sentence
+    walls, filling = zip(d.row("body absorption").refit.strength, d.row("body absorption").refit.sd)
+    assert abs(walls[0]) < 4 * walls[1] and abs(filling[0] - strength) < 4 * filling[1] + 0.05 * strength
+    before, after = (level.chi2_held_out for level in d.levels)
+    assert after < 1.10 + 4 * np.sqrt(2 / 324) < before  # 324 values
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("case", HIDDEN)
 def test_a_hidden_effect_is_found(case, tmp_path):
