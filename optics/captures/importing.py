@@ -878,7 +878,7 @@ def write_set(
     names in the folder that settings name, the files to copy there."""
     folder = Path(os.path.abspath(folder))
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        ours = {*EXTRAS, "captures.toml", "frames", "flat", "heights"}
+        ours = {*EXTRAS, "captures.toml", "frames", "flat", *_copied(folder)}
         names = [p.name for p in folder.glob("*")] if folder.is_dir() else []
         extra = [name for name in names if name not in ours and not name.startswith("flat_field.")]
         if not overwrite or extra or not (folder / "import.json").is_file():
@@ -897,6 +897,15 @@ def write_set(
             (temporary / name).parent.mkdir(exist_ok=True)
             shutil.copyfile(file, temporary / name)
     return folder
+
+
+def _copied(folder: Path) -> set[str]:
+    """Names in a capture set under which an earlier import left files that settings name."""
+    try:
+        note = json.loads((folder / "import.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return set()
+    return {"heights"} if isinstance(note, dict) and note.get("heightmaps") else set()
 
 
 def readme(facts: dict) -> str:

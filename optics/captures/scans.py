@@ -22,13 +22,14 @@ Derived, not measured, and said so:
     black      values that are cut off below (`corrections.black_levels`): masked, of blocks the whole block
     stretch    how far each press spreads the skin (optics.captures.skin_motion): `gel.stretch` and its slopes, of no
                effect until `stretched coating` is asked for
-    masks      blemishes: values that miss the median around them, or on balls a linear shading, by BLEMISH standard
-               deviations"""
+    masks      blemishes, of plates: values that miss the median around them, or on balls a linear shading, by BLEMISH
+               standard deviations"""
 
 from __future__ import annotations
 
 import math
 import re
+import shlex
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -58,6 +59,7 @@ from optics.skin.contact import STRETCH
 
 FILE, HEIGHTS = "scan.yaml", "heightmap.tmd"
 MAPS = "heights"  # folder of a capture set
+BIN = 4  # px each way that are averaged where nobody says
 LEDS = 64  # images of one scan
 SMALLEST, ACROSS = 5.0, 200  # px of a ball's radius at least, and how many of them are across an image at most
 DISTANCE = 30.0  # mm from the middle of the face to a light, where no better is known
@@ -261,19 +263,24 @@ def scans_in(source: Path, mapped: Sequence[str] = ()) -> Scans:
     taken = [s for s in scans if s.name in mapped]
     for scan in taken:
         _check_map(source, scan, first)
-    alike = [s for s in others if _same_bench(s, first)]
-    flats = [s for s in alike if "flat" in s.name.lower()] or [s for s in alike if s.heights is None] or alike
-    flats = [s for s in flats if s.name not in mapped]
+    alike = [s for s in others if _same_bench(s, first) and s.name not in mapped]
+    level = [s for s in alike if s.heights is None]
+    flats = [s for s in level if _is_flat(s)] or level or [s for s in alike if _is_flat(s)]
     if not flats:
         have = ", ".join(f"{s.name} {s.images.shape[2]} x {s.images.shape[1]} px" for s in others) or "none"
         raise BadCapture(
             f"{source}: no flat field for {first.name} ({first.images.shape[2]} x {first.images.shape[1]} px, LEDs "
             f"{', '.join(first.labels)}): scans without circles: {have}; needed: one of nothing pressed, with the same "
-            "camera and LEDs"
+            "camera and LEDs" + ", that --heightmap does not name" * bool(mapped)
         )
     used = [s for s in plates if _same_bench(s, first)]
     left = [s for s in scans if s is not flats[0] and not any(s is u for u in (*used, *taken))]
     return Scans(used, taken, flats[0], _unused(left, first))
+
+
+def _is_flat(scan: Scan) -> bool:
+    """Whether a scan is called a flat field."""
+    return "flat" in scan.name.lower()
 
 
 def _same_bench(scan: Scan, first: Scan) -> bool:
@@ -295,6 +302,12 @@ def _check_map(source: Path, scan: Scan, first: Scan) -> None:
             f"{', '.join(first.labels)}"
         )
     heights, steps = read_tmd(scan.heights, where)
+    deep = float(np.ptp(heights))
+    if not 0 < deep < THICKNESS:
+        raise BadCapture(
+            f"{where}: heights from {heights.min():.4g} to {heights.max():.4g} mm; allowed: heights in mm that "
+            f"differ, by less than the gel's thickness of {THICKNESS:g} mm"
+        )
     has = [step * count for step, count in zip(steps, heights.shape[::-1])]
     wanted = [count * first.mm_per_pixel for count in first.images.shape[2:0:-1]]
     if any(abs(own / seen - 1) > COVERED for own, seen in zip(has, wanted)):
@@ -310,9 +323,9 @@ def _unused(left: Sequence[Scan], first: Scan) -> list[str]:
     others = [s.name for s in left if s.name not in shaped]
     found = []
     if others:
-        found.append(f"not used: {', '.join(others)} (another camera or other LEDs, or nothing pressed)")
+        found.append(f"not used: {', '.join(others)} (another camera or other LEDs, or neither balls nor a {HEIGHTS})")
     if shaped:
-        options = " ".join(f"--heightmap {name}" for name in shaped)
+        options = " ".join(f"--heightmap {shlex.quote(name)}" for name in shaped)
         found.append(f"not used: {', '.join(shaped)} (no balls); '{options}' takes the shape from {HEIGHTS}")
     return found
 
@@ -438,7 +451,7 @@ def import_scans(
     source: str | Path,
     folder: str | Path,
     *,
-    bin: int = 4,
+    bin: int | None = None,
     saturation: float = 255.0,
     mapped: Sequence[str] = (),
     overwrite: bool = False,
@@ -446,8 +459,8 @@ def import_scans(
 ) -> Imported:
     """Write scans of pressed plates as a capture set with its scene; see the module's text for what is derived.
 
-    bin      pixels per side that are averaged into one; rows and columns that fill no block are left out, as many on
-             both sides
+    bin      pixels per side that are averaged into one, None: BIN, or as many as leave an image; rows and columns that
+             fill no block are left out, as many on both sides
     mapped   names of further scans, whose maps of heights press the gel
 
     Raises BadCapture, OutputExists; UnknownKey for a name that no scan has."""
@@ -456,8 +469,10 @@ def import_scans(
     scans, flat = read.plates, read.flat
     first = scans[0]
     height, width = first.images.shape[1:3]
-    if not 1 <= int(bin) == bin <= min(height, width) // 32:
-        raise BadCapture(f"{source}: bin = {bin}; allowed: whole numbers from 1 to {min(height, width) // 32}")
+    most = min(height, width) // 32
+    bin = max(min(BIN, most), 1) if bin is None else bin
+    if not 1 <= int(bin) == bin <= most:
+        raise BadCapture(f"{source}: bin = {bin}; allowed: whole numbers from 1 to {most}")
     scale, warnings = first.mm_per_pixel * bin, list(read.unused)
     steps = len(scans) + 1
     tick("import", 0, steps)
@@ -491,12 +506,9 @@ def import_scans(
     for scan in read.mapped:
         settings.append(_mapped_pose(scan))
         warnings.append(
-            f"{scan.name}: pressed by {HEIGHTS}, which was derived from images: '--hold-out {scan.name}' keeps it out "
-            "of the fit"
+            f"{scan.name}: pressed by {HEIGHTS}, which was derived from images, and held out of a fit; if you name "
+            f"others to hold out, name it too: '--hold-out {shlex.quote(scan.name)}'"
         )
-    if read.mapped:  # what presses is a setting of each frame then
-        for pose in settings[: len(scans)]:
-            pose |= {"gel.indenter": "balls", "gel.indenter_size": first.radius}
     frames, masked, dark, drift = [], [], [], []
     for scan, images, ratio, offset, pose in zip(scans, cut, ratios, offsets, settings):
         for k, label in enumerate(scan.labels):
@@ -512,7 +524,9 @@ def import_scans(
     for scan, pose in zip(read.mapped, settings[len(scans) :]):
         for label, whole, level in zip(scan.labels, scan.images, flats):
             image = filled(whole, bin, saturation, black)[..., 0]
-            frames.append(_frame(scan, label, image, level, ~_cut_off(image, level, black), pose))
+            lost = _cut_off(image, level, black)
+            dark.append(float(lost.mean()))
+            frames.append(_frame(scan, label, image, level, ~lost, pose))
     if max(masked) > 0:
         warnings.append(
             f"dust, hair or glints: {100 * float(np.mean(masked)):.2g} % of the values are masked, up to "
@@ -531,6 +545,9 @@ def import_scans(
             pose |= {f"gel.{key}": pose.get(f"gel.{key}", 0.0) for key in STRETCH}
     facts = _facts(source, scans, flat, plates, motions, bin, scale, shape, noise, lights, warnings)
     facts["corrections"] = corrections
+    if read.mapped:
+        facts["heightmaps"] = [scan.name for scan in read.mapped]
+        facts["setup"]["held_out"] = [scan.name for scan in read.mapped]
     path = write_set(
         Path(folder),
         frames,
@@ -575,7 +592,7 @@ def _corrections(bin: int, masked: Sequence[float]) -> list[dict[str, str]]:
         found.append(correction("pixels are averaged", f"blocks of {bin} x {bin} px", "all images and flat fields"))
     if max(masked) > 0:
         share = f"{100 * float(np.mean(masked)):.2g} % of the values, up to {100 * max(masked):.2g} % of a frame"
-        found.append(correction("dust, hair and glints are masked", share, "each scan and LED"))
+        found.append(correction("dust, hair and glints are masked", share, "each plate and LED"))
     return found
 
 
@@ -759,6 +776,7 @@ def readme(facts: Mapping) -> str:
             f"- balls of {facts['ball_radius_mm']:g} mm radius, {facts['ball_spacing_mm']:g} mm apart; "
             f"{facts['mm_per_pixel']:.6g} mm/px",
             f"- flat field: {facts['flat_field']}, one for each LED",
+            *(f"- {name}: the shape of its {HEIGHTS}" for name in facts.get("heightmaps", ())),
             "",
             "Derived",
             *places,

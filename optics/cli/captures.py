@@ -190,7 +190,9 @@ def import_(
         "dark_noise": dark_noise,
         "overwrite": force,
     }
-    if heightmap and (mosaic is not None or not scans.is_scan_source(source)):
+    if heightmap and mosaic is not None:
+        raise ValueError("--heightmap, --mosaic: one is for folders of scans, the other for raw frames; leave one out")
+    if heightmap and not scans.is_scan_source(source):
         raise ValueError(f"--heightmap: for folders of scans ({scans.FILE}) only, and {source} is none; leave it out")
     if mosaic is None and hyperspectral.is_cube_source(source):
         if of_presses:
@@ -229,7 +231,12 @@ def import_(
             raise ValueError(f"{', '.join(of_presses)}: scan.yaml says so; leave these out")
         with terminal.progress() as progress:
             found = scans.import_scans(
-                source, output, mapped=heightmap or (), **blocks, overwrite=force, progress=progress
+                source,
+                output,
+                mapped=[n.rstrip("/") for n in heightmap or ()],
+                **blocks,
+                overwrite=force,
+                progress=progress,
             )
         _tell(found.folder, found.warnings, found.facts["corrections"])
         return

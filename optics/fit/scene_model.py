@@ -951,7 +951,9 @@ def _with_files(captures: Captures, scene: Scene) -> Captures:
             parameter = scene.parameters.get(key)
             if parameter is not None and parameter.files and str(value).endswith(parameter.files):
                 file = captures.folder / str(value)
-                own[key] = str(file.resolve()) if file.is_file() else value
+                if file.is_file():
+                    own[key] = str(file.resolve())
+                    captures.files[str(value)] = file
         return own
 
     frames = [replace(f, parameters=found(f.parameters)) for f in captures.frames]

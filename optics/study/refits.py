@@ -74,8 +74,8 @@ class Refits:
 
     def foresee(self, sets: Sequence[Sequence[Variable]], say: Callable[[str, int, int], None]) -> None:
         """Chord steps of each set of variables, and the calibrations that these call for. All are held against the best
-        of the chord steps, so that what is followed does not depend on how many processes make them, or in what
-        order."""
+        of the chord steps, and of what an earlier diagnosis has left, so that what is followed does not depend on how
+        many processes make them."""
         if not self.by_chords():
             return
         wanted = [extra for extra in sets if self.curved(extra) < 2 and not self._begun(extra)]
@@ -93,6 +93,8 @@ class Refits:
         leader = self.leader() if sets else 0.0
         open_ = [extra for extra in sets if self.unfinished(self.chords[_names(extra)], leader)]
         jobs = [partial(_tried, make=partial(_calibrated, **self._calibrated_of(extra, leader))) for extra in open_]
+        if jobs:
+            say("calibrations", 0, len(jobs))
         for n, (k, found) in enumerate(self.model.each(self.base.frames, jobs), 1):
             if found is not None:
                 self.results[_names(open_[k])] = found = self._as_ours(found, open_[k])

@@ -280,12 +280,15 @@ def test_a_map_of_heights_presses_the_gel_where_it_is_asked_for(shaped, tmp_path
     assert unused == ["not used: coin (no balls); '--heightmap coin' takes the shape from heightmap.tmd"]
     earlier = tmp_path / "captures" / "heights"
     earlier.mkdir(parents=True)
-    for file in (earlier / "stamp.tmd", earlier.parent / "import.json"):
-        file.write_text("")
+    (earlier / "stamp.tmd").write_text("")
+    (earlier.parent / "import.json").write_text('{"heightmaps": ["stamp"]}')
     found = scans.import_scans(shaped, earlier.parent, bin=8, mapped=["coin"], overwrite=True)
     assert [f.name for f in earlier.iterdir()] == ["coin.tmd"]
-    assert any("'--hold-out coin' keeps it out of the fit" in w for w in found.warnings)
-    model = open_model(setup_for(found.folder))
+    assert any("name it too: '--hold-out coin'" in w for w in found.warnings)
+    model = open_model(setup := setup_for(found.folder))
+    assert setup.held_out == ["coin"] and "heights/coin.tmd" in model.captures.files
+    wider = model.at(Values({"gel.indenter_size": 0.3}), 0)
+    assert wider["gel.indenter_size"] == 0.3  # the size of balls may be calibrated
     groups = [f.group for f in model.frames]
     assert groups == ["balls"] * 3 + ["coin"] * 3
     position = model.renderer.hits(model.at(Values(), groups.index("coin"))).position
@@ -303,15 +306,31 @@ def test_a_map_of_heights_presses_the_gel_where_it_is_asked_for(shaped, tmp_path
         ("balls", "has circles: it is imported as a plate of balls"),
         ("flat", "flat/heightmap.tmd: no such file"),
         ("small", "3.072 x 2.304 mm, but the image shows 6.144 x 4.608 mm"),
+        ("deep", "heights from -300 to -180 mm; allowed: heights in mm that differ, by less than the gel's thickness"),
     ],
 )
 def test_a_map_that_cannot_be_used_is_refused(shaped, tmp_path, name, message):
     shutil.copytree(shaped, tmp_path / "scans")
     shutil.copytree(shaped / "coin", tmp_path / "scans" / "small")
+    shutil.copytree(shaped / "coin", tmp_path / "scans" / "deep")
     write_map(tmp_path / "scans" / "small" / "heightmap.tmd", hill(), SCALE / 2)
+    write_map(tmp_path / "scans" / "deep" / "heightmap.tmd", 1e3 * hill())
     with pytest.raises((BadCapture, UnknownKey)) as error:
         scans.import_scans(tmp_path / "scans", tmp_path / "out", bin=8, mapped=[name])
     assert message in str(error.value)
+
+
+def test_a_scan_with_a_map_is_no_flat_field(shaped, tmp_path):
+    folder = tmp_path / "scans"
+    shutil.copytree(shaped, folder)
+    (folder / "coin").rename(folder / "a_flat_coin")
+    assert scans.scans_in(folder).flat.name == "flat"
+    assert scans.scans_in(folder, ["a_flat_coin"]).flat.name == "flat"
+    (folder / "flat").rename(folder / "background")
+    assert scans.scans_in(folder, ["a_flat_coin"]).flat.name == "background"
+    shutil.rmtree(folder / "background")
+    with pytest.raises(BadCapture, match="one of nothing pressed.*that --heightmap does not name"):
+        scans.scans_in(folder, ["a_flat_coin"])
 
 
 def test_a_prior_of_the_user_leaves_the_other_advised_ones(tmp_path):
