@@ -75,6 +75,7 @@ BEHIND = {
     "near": ": of each press, the mean of those before and after it; its noise is part of the stated one",
 }
 EXTRAS = ("scene.xml", "import.json", "README.txt")
+MAPS = "heights"  # folder of a capture set, for maps of heights
 BACKGROUNDS = ("median", "near", "given")
 
 
@@ -900,12 +901,12 @@ def write_set(
 
 
 def _copied(folder: Path) -> set[str]:
-    """Names in a capture set under which an earlier import left files that settings name."""
+    """The folder of a capture set in which an earlier import left maps of heights, if it did."""
     try:
         note = json.loads((folder / "import.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return set()
-    return {"heights"} if isinstance(note, dict) and note.get("heightmaps") else set()
+    return {MAPS} if isinstance(note, dict) and note.get("heightmaps") else set()
 
 
 def readme(facts: dict) -> str:

@@ -46,7 +46,7 @@ from optics.captures.corrections import (
     drift_text,
     sentences,
 )
-from optics.captures.importing import Imported, comment, filled, noise_of_levels, write_set
+from optics.captures.importing import MAPS, Imported, comment, filled, noise_of_levels, write_set
 from optics.captures.noise import Noise
 from optics.captures.skin_motion import SkinMotion, skin_motion
 from optics.errors import BadCapture, UnknownKey
@@ -58,7 +58,6 @@ from optics.files.yaml_checks import short
 from optics.skin.contact import STRETCH
 
 FILE, HEIGHTS = "scan.yaml", "heightmap.tmd"
-MAPS = "heights"  # folder of a capture set
 BIN = 4  # px each way that are averaged where nobody says
 LEDS = 64  # images of one scan
 SMALLEST, ACROSS = 5.0, 200  # px of a ball's radius at least, and how many of them are across an image at most
@@ -252,8 +251,9 @@ def scans_in(source: Path, mapped: Sequence[str] = ()) -> Scans:
     folders = sorted(p.parent for p in source.glob(f"*/{FILE}"))
     if not folders:
         raise BadCapture(f"{source}: holds no folder with a {FILE}; allowed: scans of pressed balls and a flat field")
+    names = [folder.name for folder in folders]
     for name in mapped:
-        if name not in (names := [folder.name for folder in folders]):
+        if name not in names:
             raise UnknownKey(name, names, "scan", str(source))
     scans = [read_scan(folder) for folder in folders]
     plates, others = [s for s in scans if len(s.circles)], [s for s in scans if not len(s.circles)]
