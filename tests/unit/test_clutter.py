@@ -167,6 +167,7 @@ def rates(sets: Sets, count: int, k: int, strength: float, level: float, pattern
     return np.mean(np.array(found) < level, 0)
 
 
+@pytest.mark.slow
 def test_what_others_say_finds_an_effect_of_five_errors_where_there_is_no_clutter():
     """Among 39 effects. Without an effect .01 is kept, to three sd of 300 sets."""
     sets = Sets(1)

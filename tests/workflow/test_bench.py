@@ -154,7 +154,7 @@ def at_the_noise(chi2_per_dof: float, count: int) -> bool:
 DEAR = (
     *("leak", "stray light", "film reflections", "dispersive retardance", "gamma", "coloured leak", "scale", "stress"),
     *("drift", "misalignment", "misalignment and leak", "retardance", "depolarization", "depolarization and drift"),
-    *("dark offset", "retardance along a polarizer", "backlash", "wobble"),
+    *("dark offset", "retardance along a polarizer", "backlash", "wobble", "polarized source"),
 )
 
 

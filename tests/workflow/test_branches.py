@@ -64,7 +64,8 @@ def begun(tmp_path, seed, **options):
     return loop.begin(setup, tmp_path / "study")
 
 
-@pytest.mark.parametrize("seed", [pytest.param(1, marks=pytest.mark.slow), 3])
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 3])
 def test_each_photograph_finds_its_side_of_the_extinction(mitsuba, tmp_path, seed):
     """The brightness of each is the same on both sides; left on the sides that they began on, the first set
     ends with a lamp of 87 +- 16 where 380 is right."""

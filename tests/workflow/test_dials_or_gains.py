@@ -1,6 +1,7 @@
 """Photographs behind a film that is turned by hand, whose errors nobody states: an error of each, or a gain of each?"""
 
 import numpy as np
+import pytest
 from PIL import Image
 
 from optics.study import loop
@@ -66,6 +67,7 @@ def test_a_dial_that_is_read_by_eye_gets_its_width_and_nothing_is_missing(mitsub
     assert d.word == "NOTHING", d.sentence
 
 
+@pytest.mark.slow
 def test_gains_that_no_dial_makes_are_a_claim(mitsuba, tmp_path):
     """Gains that scatter by 20 % are fitted to the noise by films that are up to 20 deg off, as nobody sets them."""
     d = judged(tmp_path, gains=np.exp(drawn(0.2)))
@@ -79,6 +81,7 @@ def test_held_out_frames_verify_gains_by_where_their_dials_would_stand(mitsuba, 
     assert d.levels[-1].fall > 100 and d.levels[-1].frames_better == d.levels[-1].frames
 
 
+@pytest.mark.slow
 def test_a_response_curve_beside_errors_of_a_dial_is_no_drift(mitsuba, tmp_path):
     """A gain of each frame explains both."""
     d = judged(tmp_path, errors=drawn(0.5), gamma=1.25)
