@@ -18,7 +18,8 @@ Derived, not measured, and said so:
                CONTACT times the ball's
     noise      variance against signal of half the squared differences of neighbours in image over flat field, where no
                ball is near
-    lights     the direction of the least-squares fit I/F = l.n + c on the balls, at DISTANCE
+    lights     the direction of the least-squares fit I/F = l.n + c on the balls, both less the pedestal, at DISTANCE
+    pedestal   what the camera reads without light, by the noise of its pictures (`photon_noise`), unless it is given
     black      values that are cut off below (`corrections.black_levels`): masked, of blocks the whole block
     stretch    how far each press spreads the skin (optics.captures.skin_motion): `gel.stretch` and its slopes, of no
                effect until `stretched coating` is asked for
@@ -48,6 +49,7 @@ from optics.captures.corrections import (
 )
 from optics.captures.importing import MAPS, Imported, comment, filled, noise_of_levels, write_set
 from optics.captures.noise import Noise
+from optics.captures.photon_noise import PhotonNoise, photon_noise
 from optics.captures.skin_motion import SkinMotion, skin_motion
 from optics.errors import BadCapture, UnknownKey
 from optics.files import yaml_checks
@@ -361,7 +363,8 @@ def nearest(shape: tuple[int, ...], balls: np.ndarray, mm_per_pixel: float) -> t
 def neighbour_noise(ratios: np.ndarray, flats: np.ndarray, use: np.ndarray, saturation: float) -> Noise:
     """Noise from neighbours along rows: half the squared difference of image over flat field, times the flat field.
 
-    ratios, flats (F, H, W);   use (F, H, W) bool: the level face. The coating's grain counts as noise."""
+    ratios, flats (F, H, W) less the black level;   saturation as much;   use (F, H, W) bool: the level face. The
+    coating's grain counts as noise."""
     level = (flats[..., 1:] + flats[..., :-1]) / 2
     square = (np.diff(ratios, axis=2) * level) ** 2 / 2
     both = use[..., 1:] & use[..., :-1] & (level < 0.9 * saturation)
@@ -453,6 +456,7 @@ def import_scans(
     *,
     bin: int | None = None,
     saturation: float = 255.0,
+    black_level: float | None = None,
     mapped: Sequence[str] = (),
     overwrite: bool = False,
     progress: Callable[[str, int, int], None] | None = None,
@@ -461,6 +465,7 @@ def import_scans(
 
     bin      pixels per side that are averaged into one, None: BIN, or as many as leave an image; rows and columns that
              fill no block are left out, as many on both sides
+    black_level   DN without light; None: what the noise says, or 0
     mapped   names of further scans, whose maps of heights press the gel
 
     Raises BadCapture, OutputExists; UnknownKey for a name that no scan has."""
@@ -477,6 +482,10 @@ def import_scans(
     steps = len(scans) + 1
     tick("import", 0, steps)
     black = black_levels([i for s in (*scans, *read.mapped, flat) for i in s.images])
+    told = None
+    if black_level is None and black == [None]:
+        told = photon_noise([s.images[..., 0] for s in (*scans, flat)], saturation, STEP)
+    pedestal = black_level if black_level is not None else round(told.black_level, 2) if told else 0.0
     flats = np.stack([filled(i, bin, saturation, black)[..., 0] for i in flat.images])
     plates, cut, settings, motions = [], [], [], {}
     for done, scan in enumerate(scans, 1):
@@ -495,11 +504,13 @@ def import_scans(
         tick("import", done, steps)
     shape = flats.shape[1:]
     offsets, distances = zip(*(nearest(shape, p.balls, scale) for p in plates))
-    ratios = [images / np.maximum(flats, 1.0) for images in cut]
+    above = np.maximum(flats - pedestal, STEP)
+    ratios = [(images - pedestal) / above for images in cut]
     level = np.stack([np.broadcast_to(d > NEAR * s.radius, flats.shape) for d, s in zip(distances, scans)])
     noise = neighbour_noise(
-        np.concatenate(ratios), np.concatenate([flats] * len(scans)), level.reshape(-1, *shape), saturation
+        np.concatenate(ratios), np.concatenate([above] * len(scans)), level.reshape(-1, *shape), saturation - pedestal
     )
+    noise = replace(noise, black_level=pedestal, saturation=saturation)
     lights = _lights(scans, ratios, offsets, distances)
     for pose, *shown in zip(settings, scans, ratios, offsets):
         pose["gel.press_depth"] = round(_depth(*shown, lights), 6)
@@ -513,7 +524,7 @@ def import_scans(
     for scan, images, ratio, offset, pose in zip(scans, cut, ratios, offsets, settings):
         for k, label in enumerate(scan.labels):
             # a ratio has the noise of the image and of the flat field
-            sd = noise.sd(flats[k]) * math.sqrt(2) / np.maximum(flats[k], 1.0)
+            sd = noise.sd(flats[k]) * math.sqrt(2) / above[k]
             off = blemishes(ratio[k], sd, offset, scan.radius)
             masked.append(float(off.mean()))
             lost = _cut_off(images[k], flats[k], black)
@@ -533,6 +544,9 @@ def import_scans(
             f"{100 * max(masked):.2g} % of a frame"
         )
     corrections = _corrections(bin, masked)
+    if told:
+        text = f"{told.black_level:.3g} +- {told.sd:.2g} DN, where the line of photon noise against signal ends"
+        corrections.append(correction("a black level that nobody stated is subtracted", text, "all images"))
     if max(dark) > 0:
         remark, entry = black_text(black, [float(np.mean(dark))])
         warnings.append(remark)
@@ -545,6 +559,7 @@ def import_scans(
             pose |= {f"gel.{key}": pose.get(f"gel.{key}", 0.0) for key in STRETCH}
     facts = _facts(source, scans, flat, plates, motions, bin, scale, shape, noise, lights, warnings)
     facts["corrections"] = corrections
+    facts["black_level"] = _pedestal(black_level, told)
     if read.mapped:
         facts["heightmaps"] = [scan.name for scan in read.mapped]
         facts["setup"]["held_out"] = [scan.name for scan in read.mapped]
@@ -691,6 +706,15 @@ def _facts(
     }
 
 
+def _pedestal(given: float | None, told: PhotonNoise | None) -> dict[str, Any]:
+    """The black level that was written, and where it is from."""
+    if given is not None:
+        return {"DN": given, "by": "given"}
+    if told is None:
+        return {"DN": 0.0, "by": "assumed"}
+    return {"DN": round(told.black_level, 2), "sd_DN": round(told.sd, 2), "by": "photon noise"}
+
+
 def _motion(motion: SkinMotion | None) -> dict[str, Any] | None:
     if motion is None:
         return None
@@ -784,6 +808,7 @@ def readme(facts: Mapping) -> str:
             f"- images of {width} x {height} px, means of blocks of {facts['bin']} px",
             f"- noise: {facts['noise']['system_gain']:.3g} DN/DN and {facts['noise']['dark_noise']:.3g} DN, by "
             "neighbours of the level face; the coating's grain counts as noise",
+            f"- black level: {_of_pedestal(facts['black_level'])}",
             f"- lights in scene.xml: azimuths {azimuths} deg by the balls' shading, seen from the middle of the view; "
             "assumed: one circle, parallel to the face, its distance, lights without a lobe; calibrate them",
             "",
@@ -793,6 +818,21 @@ def readme(facts: Mapping) -> str:
             "- free: the circle's middle, height and size, and where on it each LED stands (turn)",
             "",
         ]
+    )
+
+
+def _of_pedestal(fact: Mapping[str, Any]) -> str:
+    if fact["by"] == "given":
+        return f"{fact['DN']:g} DN, given"
+    if fact["by"] == "assumed":
+        return (
+            "0 DN, assumed: the noise of the images tells none; take an image with the lens covered and import again "
+            "with '--black-level' its mean"
+        )
+    return (
+        f"{fact['DN']:.3g} DN, to {fact['sd_DN']:.2g} DN: there the line of photon noise against signal ends. Dark "
+        "noise of r DN makes it r^2/K too low, with K DN of variance per DN of light; an image with the lens covered "
+        "is better: give its mean as '--black-level'"
     )
 
 

@@ -141,7 +141,9 @@ def import_(
         typer.Option("--bands", metavar="400:700:10", help="For cubes: join bands, nm.", show_default="as they are"),
     ] = None,
     bits: Annotated[int | None, typer.Option("--bits", help="For raw frames and cubes. Without it: derived.")] = None,
-    black_level: Annotated[float | None, typer.Option("--black-level", help="For raw frames and cubes, DN.")] = None,
+    black_level: Annotated[
+        float | None, typer.Option("--black-level", help="DN without light: for scans, raw frames, cubes.")
+    ] = None,
     system_gain: Annotated[
         float | None, typer.Option("--system-gain", help="For raw frames and cubes, DN per electron.")
     ] = None,
@@ -166,7 +168,7 @@ def import_(
         "--rename": rename,
         "--scene": scene,
         "--bits": bits,
-        "--black-level": black_level,
+        **({} if scans.is_scan_source(source) else {"--black-level": black_level}),
         "--system-gain": system_gain,
         "--dark-noise": dark_noise,
     }
@@ -234,6 +236,7 @@ def import_(
                 source,
                 output,
                 mapped=[n.rstrip("/") for n in heightmap or ()],
+                black_level=black_level,
                 **blocks,
                 overwrite=force,
                 progress=progress,

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import yaml
 from PIL import Image
+from scipy.ndimage import gaussian_filter
 
 from optics.captures import capture_set, scans
 from optics.errors import BadCapture, UnknownKey
@@ -35,9 +36,10 @@ def middles(x, y, turn):
     return {k: p for k, p in at.items() if abs(p[0]) < edge[0] and abs(p[1]) < edge[1]}
 
 
-def shaded(balls, azimuth, rng, spots=()):
+def shaded(balls, azimuth, rng, spots=(), pedestal=0.0, blur=0.0):
     """A picture in DN: a far light 50 deg high over half balls on a plane, some light from all sides, a fall-off across
-    the face, shot noise; a dark speck at each of `spots`."""
+    the face, shot noise; a dark speck at each of `spots`; of a lens that blurs by `blur` px, and a
+    camera that adds a pedestal."""
     v, u = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     x, y = (u - WIDTH / 2) * SCALE, (v - HEIGHT / 2) * SCALE
     nx, ny = np.zeros_like(x), np.zeros_like(x)
@@ -49,17 +51,19 @@ def shaded(balls, azimuth, rng, spots=()):
     signal = 90 * (1 + 0.05 * (x * np.cos(turn) + y * np.sin(turn))) * (np.maximum(direct, 0) + 0.3)
     for row, column in spots:
         signal[row : row + 10, column : column + 10] *= 0.5
-    return np.clip(np.round(signal + np.sqrt(GAIN * signal) * rng.standard_normal(signal.shape)), 0, 255)
+    signal = gaussian_filter(signal, blur)
+    noisy = signal + np.sqrt(GAIN * signal) * rng.standard_normal(signal.shape)
+    return np.clip(np.round(noisy + pedestal), 0, 255)
 
 
 def circle(x, y, gx, gy):
     return {"type": "GridCircle", "gx": gx, "gy": gy, "x": x, "y": y}
 
 
-def write_scan(folder, balls, rng, annotated=True, spots=(), **changed):
+def write_scan(folder, balls, rng, annotated=True, spots=(), pedestal=0.0, blur=0.0, **changed):
     folder.mkdir(parents=True)
     for label, azimuth in AZIMUTHS.items():
-        picture = shaded(list(balls.values()), azimuth, rng, spots)
+        picture = shaded(list(balls.values()), azimuth, rng, spots, pedestal, blur)
         Image.fromarray(picture.astype(np.uint8)).save(folder / f"image{label}.png")
     at = {k: (float(a / SCALE + WIDTH / 2 - 0.5), float(b / SCALE + HEIGHT / 2 - 0.5)) for k, (a, b) in balls.items()}
     circles = [circle(x, y, i, j) for (i, j), (x, y) in at.items()]
@@ -101,6 +105,28 @@ def test_plates_noise_and_lights_are_derived(imported):
     assert imported.facts["noise"]["system_gain"] * 90 + imported.facts["noise"]["dark_noise"] ** 2 == pytest.approx(
         expected, rel=0.15
     )
+
+
+@pytest.mark.slow
+def test_a_pedestal_is_found_in_the_noise_unless_it_is_given(imported, tmp_path, monkeypatch):
+    """12 DN, of a camera without dark noise behind a lens that blurs; and none where there is none."""
+    assert imported.facts["black_level"] == {"DN": 0.0, "by": "assumed"}
+    assert "black level: 0 DN, assumed" in (imported.folder / "README.txt").read_text()
+    for name, value in {"HEIGHT": 2 * HEIGHT, "WIDTH": 2 * WIDTH, "SCALE": SCALE / 2}.items():
+        monkeypatch.setitem(globals(), name, value)
+    rng, camera = np.random.default_rng(5), {"pedestal": 12.0, "blur": 1.2}
+    write_scan(tmp_path / "in" / "one", middles(0.13, -0.21, 2.0), rng, **camera)
+    write_scan(tmp_path / "in" / "flat", {}, rng, annotated=False, **camera)
+    found = scans.import_scans(tmp_path / "in", tmp_path / "out", bin=4)
+    told = found.facts["black_level"]
+    assert told["by"] == "photon noise"
+    assert told["DN"] == pytest.approx(12.0, abs=3 * told["sd_DN"])
+    assert capture_set.load(found.folder).noise.black_level == told["DN"]
+    assert any("black level" in c["what"] for c in found.facts["corrections"])
+    assert found.facts["light_azimuths_deg"] == pytest.approx(AZIMUTHS, abs=1.0)
+    given = scans.import_scans(tmp_path / "in", tmp_path / "out2", bin=4, black_level=11.0)
+    assert given.facts["black_level"] == {"DN": 11.0, "by": "given"}
+    assert capture_set.load(given.folder).noise.black_level == 11.0
 
 
 @pytest.mark.slow
