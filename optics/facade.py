@@ -302,8 +302,8 @@ class Study:
 
     @property
     def effects(self) -> list[str]:
-        """Names of the effects that were added, in their order."""
-        return [step["name"] for step in self.record.steps if step["effect"]]
+        """Names of the effects that were added and not dropped, in their order."""
+        return [e.name for e in loop.effects_of(self.record, self.model.scene.registry)]
 
     @property
     def model(self) -> SceneModel:
@@ -374,25 +374,35 @@ class Study:
             self._verdict = loop.examine_in_cells(self.record, model, self.setup, cells, *asked)
         return self._verdict
 
-    def add(self, effect: str, *, start: Values | None = None, progress: Progress | None = None) -> Fit:
+    def add(
+        self, effect: str, *, drop: Sequence[str] = (), start: Values | None = None, progress: Progress | None = None
+    ) -> Fit:
         """Free an effect, calibrate everything again, and record it as the next step.
 
         effect   its name or key, as `optics effects` lists them
+        drop     effects that were added before and that this one replaces: the model is without them from here on
         start    values to begin from; None: those of the diagnosis's refit, if this object has diagnosed the last step,
                  else the present values with the effect a little off neutral
 
-        Raises UnknownKey for an unknown effect, ValueError for one that the study has.
+        Raises UnknownKey for an unknown effect, ValueError for one that the study has, or has not to drop.
         """
         model = self.model
         chosen = model.scene.registry.find_effect(effect)
-        if self.record.has(chosen.key):
+        dropped = [model.scene.registry.find_effect(name) for name in drop]
+        for other in dropped:
+            if other.key not in self.record.added():
+                raise ValueError(
+                    f"{self.folder}: '{other.name}' is no part of the study, so that it cannot be dropped; allowed: "
+                    f"{', '.join(self.effects) or 'nothing, as no effect was added'}"
+                )
+        if chosen.key in self.record.added():
             raise ValueError(
                 f"{self.folder}: '{chosen.name}' is part of the study already; `optics diagnose {self.folder}` asks "
                 "what else is missing"
             )
         if start is None and self._verdict is not None and chosen.name in self._verdict.fits:
             start = self._verdict.fits[chosen.name].values
-        self._fit, _ = loop.extend(self.record, model, self.setup, self.fit, chosen, start, progress)
+        self._fit, _ = loop.extend(self.record, model, self.setup, self.fit, chosen, start, progress, dropped)
         self._verdict = None
         return self._fit
 

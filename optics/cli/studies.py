@@ -237,6 +237,10 @@ def diagnose(
 def add(
     study: StudyFolder,
     effect: Annotated[str, typer.Argument(metavar="EFFECT", help="Name of the effect (`optics effects`).")],
+    drop: Annotated[
+        list[str] | None,
+        typer.Option("--drop", metavar="EFFECT", help="An added effect that this one replaces. Repeatable."),
+    ] = None,
     plugins: Plugins = None,
     captures: CapturesNow = None,
     as_json: AsJson = False,
@@ -248,7 +252,7 @@ def add(
 
     found = Study.open(study, plugins=plugins, captures=captures)
     with terminal.progress() as progress:
-        fit = found.add(effect, progress=progress)
+        fit = found.add(effect, drop=drop or (), progress=progress)
     told = wrapped(f"{fit.table()}\n\n{found.table()}{null_text(found)}")
     show(found.record.steps[-1]) if as_json else print(told)
 

@@ -193,6 +193,8 @@ def diagnose(
         ambiguous.append(findings.fragile)
         kinds.append([findings.fragile])
     hints = remarks.hints_of(word, conditions, outcome, findings, gaps, names)
+    if subject:
+        hints = [*remarks.replaced(case, best, added), *hints]
     text = sentence(word, conditions, findings, rows, told, fingerprints, levels, shifts, basis)
     text = " ".join(filter(None, [text, remarks.lamp_text(case, outcome, basis)]))
     if word in ("UNKNOWN", "CANNOT_TELL"):

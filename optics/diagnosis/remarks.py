@@ -19,11 +19,13 @@ from optics.diagnosis.score import KAPPA, Table
 from optics.diagnosis.text import AT_FAULT, leaves_misfit, left_of, moved_by
 from optics.diagnosis.thresholds import CLEAR, EXCESS, LEVEL
 from optics.fit.model import value_of
-from optics.words import percent, some
+from optics.scene.declare import Effect
+from optics.words import percent, some, spaced
 
 SLIGHT = 0.05  # rms change over the mean signal, within which images of other effects stay as they were to a twentieth
 RENDER_NOISE = 0.01  # of the camera's variance: Monte Carlo noise above it weakens every test
 SMOOTH = 0.7  # of the noise expected in fine detail: below, neighbouring pixels share their noise
+CERTAIN, NOTHING_LEFT = 5.0, 3.0  # standard deviations of an effect that was there, and of one that is not any more
 SWUNG = 0.1  # of the excess: a lamp that makes more of it is mentioned
 REPEATABLE = 1000  # times as many frames: above, repeats are no advice
 # where no shot was simulated
@@ -219,6 +221,33 @@ def lamp_text(case: Case, outcome: Outcome, basis: Basis) -> str:
         f"{percent(min(share, 1.0), 2)} of the excess and counts as noise: a lamp or an exposure that changes from "
         f"frame to frame.{more}"
     )
+
+
+def replaced(case: Case, best: Trial, added: Sequence[Effect]) -> list[str]:
+    """A sentence for each effect, added before, of which the best explanation leaves nothing certain.
+
+    Its strengths were CERTAIN errors from neutral, and are within NOTHING_LEFT errors of it, or at a tenth of what they
+    were."""
+    before = {v.name: float(s) for v, s in zip(case.fit.variables, case.fit.sd)}
+    after = {v.name: float(s) for v, s in zip(best.fit.variables, best.fit.sd)}
+    model, told = case.model, []
+    for effect in added:
+        names = {v.name for v in case.variables_of(effect)}
+        told_by = []
+        for v in (v for v in case.fit.variables if v.name in names and v.name in after):
+            neutral = v.parameter.neutral
+            was, now = value_of(model, case.fit.values, v), value_of(model, best.fit.values, v)
+            if neutral is not None and abs(was - neutral) > CERTAIN * before[v.name]:
+                gone = abs(now - neutral) < max(NOTHING_LEFT * after[v.name], abs(was - neutral) / 10)
+                told_by.append((gone, f"{v.name} {was:.3g} -> {now:.2g}{spaced(v.parameter.unit)}"))
+        if told_by and all(gone for gone, _ in told_by):
+            names_of = [c.effect.name for c in best.members]
+            told.append(
+                f"{' and '.join(names_of)} takes the place of {effect.name}, which was added before "
+                f"({', '.join(text for _, text in told_by)}): calibrate without it (optics add STUDY '{names_of[0]}' "
+                f"--drop '{effect.name}'), and compare the held-out frames"
+            )
+    return told
 
 
 def hints_of(

@@ -139,7 +139,7 @@ class View:
         variables, self.values, self.fitted = loop.kept(self.study, self.model, self.step["index"])
         self.held = sorted(set(range(len(self.model.frames))) - set(self.fitted))
         sd = {v["name"]: v["sd"] for v in self.step["variables"]}
-        added = [s["effect"] for s in self.study.steps[: self.step["index"] + 1] if s["effect"]]
+        added = self.study.added(self.step["index"])
         known = (*loop.candidates(self.model, self.study), *loop.effects_of(self.study, self.model.scene.registry))
         self.effects = {e.key: e for e in sorted(known, key=lambda e: e.key)}
         own = {

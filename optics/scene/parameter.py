@@ -6,7 +6,7 @@ declarations."""
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -284,6 +284,15 @@ class Values:
         else:
             for index in variable.frames:
                 self.frame.setdefault(index, {}).update({key: float(value) for key in variable.keys})
+
+    def without(self, variables: Iterable[Variable]) -> Values:
+        """These but for the variables', which have the values of scene and captures again, in held-out frames too."""
+        common = {key for v in variables if v.frames is None for key in v.keys}
+        own = {key for v in variables if v.frames is not None for key in v.keys}
+        return Values(
+            {key: value for key, value in self.common.items() if key not in common},
+            {i: {key: value for key, value in at.items() if key not in own} for i, at in self.frame.items()},
+        )
 
     def record(self) -> dict[str, dict]:
         """As JSON keeps them, for `of_record`."""

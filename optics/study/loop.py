@@ -137,7 +137,7 @@ def begin(
                     found = fit_from_cells(model, coarser, own, fitted, start, progress, robust)
                 else:
                     found = fit_base(model, variables, fitted, start, progress, robust=robust, tempering=True)
-            write_step(record, model, "base", None, found, held, time.perf_counter() - clock)
+            write_step(record, model, None, found, held, time.perf_counter() - clock)
         except BaseException:
             record.discard()
             raise
@@ -201,16 +201,21 @@ def kept(record: Record, model: SceneModel, index: int = -1) -> tuple[list[Varia
     """What a step's folder holds of its fit: the variables, the values, and the frames that were fitted."""
     setup = recorded(record.ladder["facts"]["setup"])
     fitted, _ = split(model, setup)
-    steps = record.steps[: len(record.steps) + index + 1] if index < 0 else record.steps[: index + 1]
-    data = record.fit(len(steps) - 1)
+    index %= len(record.steps)
+    data = record.fit(index)
     names = {f.name: i for i, f in enumerate(model.frames)}
     values = Values(dict(data["parameters"]), {names[n]: dict(own) for n, own in data["frames"].items()})
+    variables = _variables(model, setup, fitted, record.added(index))
+    return tempered(variables, record.steps[index].get("tempering", 1.0)), values, fitted
+
+
+def _variables(model: SceneModel, setup: Setup, fitted: Sequence[int], added: Sequence[str]) -> list[Variable]:
+    """What is solved for in a model to which effects were added, by their keys."""
     variables = variables_of_base(model, setup, fitted)
-    for step in steps:
-        if step["effect"]:
-            effect = model.scene.registry.find_effect(step["effect"])
-            variables += _of_fitted(effect_variables(model, effect, variables), fitted)
-    return tempered(variables, steps[-1].get("tempering", 1.0)), values, fitted
+    for key in added:
+        effect = model.scene.registry.find_effect(key)
+        variables += _of_fitted(effect_variables(model, effect, variables), fitted)
+    return variables
 
 
 def restore(record: Record, model: SceneModel, index: int = -1) -> Fit:
@@ -234,8 +239,8 @@ def _of_fitted(variables: Sequence[Variable], fitted: Sequence[int]) -> list[Var
 
 # -- what can be added -----------------------------------------------------------------------------------------------
 def effects_of(record: Record | None, registry: Registry) -> list[Effect]:
-    """The effects that the study has added so far, of the registry of its scene; none before it begins."""
-    return [] if record is None else [registry.find_effect(step["effect"]) for step in record.steps if step["effect"]]
+    """The effects in the model of the last step, of the registry of its scene; none before the study begins."""
+    return [] if record is None else [registry.find_effect(key) for key in record.added()]
 
 
 def candidates(model: SceneModel, record: Record | None, without: Sequence[str] = ()) -> list[Effect]:
@@ -434,7 +439,7 @@ def examine_in_cells(
 def _expected(record: Record, model: SceneModel, cells: Cells | None) -> list[Expected]:
     """What the diagnosis of the step before found beside the effect that this step added."""
     earlier = record.diagnosis(len(record.steps) - 2) if len(record.steps) > 1 else None
-    if earlier is None or not record.steps[-1]["effect"]:
+    if earlier is None or not record.steps[-1]["effect"] or record.steps[-1].get("dropped"):
         return []
     added = model.scene.registry.find_effect(record.steps[-1]["effect"]).name
     found = []
@@ -472,16 +477,18 @@ def extend(
     effect: Effect,
     start: Values | None = None,
     progress: Progress | None = None,
+    dropped: Sequence[Effect] = (),
 ) -> tuple[Fit, Comparison]:
     """Free an effect, calibrate everything again, and record the step.
 
-    start   values to begin from, such as those of a diagnosis's refit; None: the present ones, with the effect a little
-            off neutral
+    start     values to begin from, such as those of a diagnosis's refit; None: the present ones, with the effect a
+              little off neutral
+    dropped   effects that were added before, and are not in the model from here on
 
     Raises OutputExists where another process works on the study, or has added a step since it was opened.
     """
     with record.alone():
-        return _extended(record, model, setup, found, effect, start, progress)
+        return _extended(record, model, setup, found, effect, start, progress, dropped)
 
 
 def _extended(
@@ -492,6 +499,7 @@ def _extended(
     effect: Effect,
     start: Values | None,
     progress: Progress | None,
+    dropped: Sequence[Effect],
 ) -> tuple[Fit, Comparison]:
     fitted, held = split(model, setup)
     if not model.scene.can_express(effect):
@@ -508,16 +516,23 @@ def _extended(
             f"{model.captures.folder / capture_files.FILE}: absent: {', '.join(gone)}, which the effect "
             f"'{effect.name}' needs; allowed: effects of parts that are there, or a new study of captures without it"
         )
-    extra = _of_fitted(effect_variables(model, effect, found.variables), fitted)
+    staying, values = list(found.variables), found.values
+    if dropped:
+        keys = {e.key for e in dropped}
+        names = {v.name for v in _variables(model, setup, fitted, [k for k in record.added() if k not in keys])}
+        leaving = [v for v in staying if v.name not in names]
+        staying = [v for v in staying if v.name in names]
+        values, start = values.without(leaving), start and start.without(leaving)
+    extra = _of_fitted(effect_variables(model, effect, staying), fitted)
     if not extra:
         why = "no frame can show it" if not effect_variables(model, effect) else "the model solves for all of it"
         raise Underdetermined(
             f"{record.folder}: adding '{effect.name}' would change nothing: {why}; it needs {effect.needs or 'more'}"
         )
-    variables = tempered([*found.variables, *extra], weight_of(found.variables))
+    variables = tempered([*staying, *extra], weight_of(found.variables))
     if start is None:
-        seek(model, found.values, [effect], fitted)
-        start = off_neutral(model, found.values, extra)
+        seek(model, values, [effect], fitted)
+        start = off_neutral(model, values, extra)
     clock = time.perf_counter()
     images = model.captures.table is None
     with model.where_used():
@@ -540,7 +555,7 @@ def _extended(
         file = Path(effect.file).resolve()
         digest = file_hash(file)
         record.note_inputs({name: h for name, h in own.items() if h == digest})
-    comparison = write_step(record, model, effect.name, effect, best, held, time.perf_counter() - clock)
+    comparison = write_step(record, model, effect, best, held, time.perf_counter() - clock, dropped)
     before, after = (step["held_out"]["chi2_per_dof"] if step["held_out"] else math.nan for step in record.steps[-2:])
     if after > before:
         best.warnings.append(
@@ -553,21 +568,23 @@ def _extended(
 def write_step(
     record: Record,
     model: SceneModel,
-    name: str,
     effect: Effect | None,
     found: Fit,
     held: Sequence[int],
     seconds: float,
+    dropped: Sequence[Effect] = (),
 ) -> Comparison:
-    """Record a calibrated model as the next step of the study; returns how it compares with all frames."""
+    """Record a calibrated model as the next step of the study, the base without an effect; returns how it compares with
+    all frames."""
     with model.where_used():
         values, extra = held_out_values(model, found, held)
     comparison = comparison_of(model, values, held, len(found.variables), extra)
     found.warnings += checks.after_calibration(model, found, comparison.fitted)
     # A study that was taken up again brings the held-out poses of the step before: those found now replace them.
     everywhere = Values(dict(found.values.common), {**found.values.frame, **values.frame})
+    name = effect.name if effect else "base"
     record.add_step(
-        name,
+        f"{name} without {' and '.join(e.name for e in dropped)}" if dropped else name,
         effect.key if effect else None,
         Fit(**{**found.__dict__, "values": everywhere}),
         comparison,
@@ -576,5 +593,6 @@ def write_step(
         nulls=null_models(model, values, found.frames, held),
         background=background_of(model, values),
         origin=origin_of(model, held, len(found.variables), extra),
+        dropped=[e.key for e in dropped],
     )
     return comparison

@@ -245,8 +245,14 @@ class Record:
     def steps(self) -> list[dict]:
         return self.ladder["steps"]
 
-    def has(self, effect: str | None) -> bool:
-        return any(step["effect"] == effect for step in self.steps)
+    def added(self, index: int = -1) -> list[str]:
+        """Keys of the effects in the model of a step, in the order in which they were added."""
+        found: list[str] = []
+        for step in self.steps[: index % len(self.steps) + 1] if self.steps else ():
+            found = [key for key in found if key not in step.get("dropped", ())]
+            if step["effect"]:
+                found.append(step["effect"])
+        return found
 
     def note_inputs(self, hashes: Mapping[str, str]) -> None:
         """Record what the next steps depend on besides the inputs that the study began with: name -> hash."""
@@ -285,6 +291,7 @@ class Record:
         origin: Mapping[str, Mapping] | None = None,
         seconds: float | None = None,
         warnings: Sequence[str] = (),
+        dropped: Sequence[str] = (),
     ) -> Path:
         """Append a step and return its folder.
 
@@ -298,10 +305,11 @@ class Record:
         nulls        optics.fit.null_models.NullTable.json(): errors of models without physics
         background   mode of the flat field, and per channel how much of the background the scene explains
         origin       optics.study.calibrated.origin_of: what fit.toml says of the scene and the captures
+        dropped      keys of effects of earlier steps that are not in the model any more
 
-        Raises OutputExists when the effect has a step already.
+        Raises OutputExists when the model has the effect already, or a base.
         """
-        if self.steps and self.has(effect):
+        if self.steps and (effect is None or effect in self.added()):
             raise OutputExists(f"{self.folder}: '{name}' has a step already; start another study to add it differently")
         index = len(self.steps)
         folder = f"{index:02d}-{_slug(name)}"
@@ -315,6 +323,7 @@ class Record:
             "index": index,
             "name": name,
             "effect": effect,
+            "dropped": list(dropped),
             "folder": folder,
             "created": _now(),
             "seconds": seconds,

@@ -22,7 +22,7 @@ def test_a_resumed_study_records_the_poses_found_in_this_step(monkeypatch):
     seen = {}
     monkeypatch.setattr(loop, "shown_frames", lambda model, values, held: seen.setdefault("shown", values))
     record = SimpleNamespace(add_step=lambda name, key, kept, *a, **more: seen.setdefault("kept", kept.values))
-    loop.write_step(record, SimpleNamespace(where_used=nullcontext), "lens blur", None, fit, [1], 0.0)
+    loop.write_step(record, SimpleNamespace(where_used=nullcontext), None, fit, [1], 0.0)
     for values in (seen["shown"], seen["kept"]):
         assert values.frame == {0: {"gel.press_x": 1.1}, 1: {"gel.press_x": 2.7}}
         assert values.common == {"camera.blur": 0.5}
