@@ -146,8 +146,9 @@ def by_surface(model: Model, values: Values, evidence: Evidence, images: Sequenc
     brightness is off by, and noise alone gives it the variance 1/g'g. A law of light or of the camera goes with the
     place in the image or with the place in the contact: of b is taken the quadratic in the former and the mean over all
     contacts at the latter (CELLS each way) that fit best. What is left of it takes b^2 g'g from chi2, of which noise
-    takes 1. The share is of the chi2 of these pixels less the number of their values. NaN where no press is seen under
-    LIGHTS lights, for fewer than MANY contacts, or without excess. Of one press, pixels of the camera that differ look
+    takes 1. The share is of the chi2 of these pixels less the number of their values. Of it one brightness of each
+    contact has what the weighted mean there takes, less 1 a contact for noise. NaN where no press is seen under LIGHTS
+    lights, for fewer than MANY contacts, or without excess. Of one press, pixels of the camera that differ look
     the same, unless a flat field has divided them out.
 
     images   per frame (H, W, C) residual over its noise, 0 where it is not used"""
@@ -157,6 +158,7 @@ def by_surface(model: Model, values: Values, evidence: Evidence, images: Sequenc
     if len(contacts) < MANY:
         return Surface()
     bright, weight, square, count, *places, cell = np.concatenate(contacts, 1)
+    contact = np.repeat(np.arange(len(contacts)), [c.shape[1] for c in contacts])
     excess = float(square.sum() - count.sum())
     if excess < EXCESS * math.sqrt(2 * count.sum()):
         return Surface()
@@ -165,7 +167,16 @@ def by_surface(model: Model, values: Values, evidence: Evidence, images: Sequenc
     off = bright * np.sqrt(weight) - laws @ law  # in standard deviations
     taken = float(off @ off) - (len(off) - rank)
     spread = float(np.mean(off**2 / weight) - np.mean(1 / weight))
-    return Surface(taken / excess, math.sqrt(max(spread, 0.0)), len(contacts))
+    sums, weights = np.bincount(contact, off * np.sqrt(weight)), np.bincount(contact, weight)
+    whole = float(np.sum(sums**2 / weights)) - len(contacts)
+    apart = float(np.mean((sums / weights) ** 2 - 1 / weights))
+    return Surface(
+        taken / excess,
+        math.sqrt(max(spread, 0.0)),
+        len(contacts),
+        whole / taken if taken > 0 else math.nan,
+        math.sqrt(max(apart, 0.0)),
+    )
 
 
 def presses_of(model: Model, evidence: Evidence) -> list[list[int]]:
@@ -213,9 +224,15 @@ def surface_text(found: Surface) -> str:
     """One sentence where the surface holds more than MUCH of what is left in contacts; '' where not."""
     if not found.share > MUCH:
         return ""
-    return (
+    text = (
         f"{min(found.share, 1.0):.0%} of what is left in the {found.contacts} contacts is one brightness of each "
         f"pixel, the same under every light ({found.rms:.1%} rms), and depends neither on the place in the image nor "
         "on that in the contact: it belongs to the coating, to the body that presses or, without a flat field, to the "
         "camera's pixels, and no law of light explains it."
     )
+    if found.whole > SHARE:
+        text += (
+            f" {min(found.whole, 1.0):.0%} of that is one brightness of each contact ({found.whole_rms:.1%} rms): the "
+            "bodies that press differ, in what they reflect or in how deep they press."
+        )
+    return text

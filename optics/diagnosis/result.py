@@ -367,11 +367,14 @@ class Drift:
 @dataclass(frozen=True)
 class Surface:
     """What differs from contact to contact, the same under every light (`optics.diagnosis.patterns.by_surface`): its
-    share of the excess misfit in the contacts, its rms as a share of the brightness, and their number."""
+    share of the excess misfit in the contacts, its rms as a share of the brightness, and their number; how much of it
+    is one brightness of each contact, and the rms of that."""
 
     share: float = math.nan
     rms: float = math.nan
     contacts: int = 0
+    whole: float = math.nan
+    whole_rms: float = math.nan
 
 
 @dataclass(frozen=True)

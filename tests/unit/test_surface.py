@@ -58,6 +58,18 @@ def test_a_brightness_of_each_pixel_is_the_surface():
     assert found.contacts == 36 and found.share == pytest.approx(1.0, abs=0.04)
     assert found.rms == pytest.approx(0.02, rel=0.04)
     assert "one brightness of each pixel, the same under every light (2.0% rms)" in surface_text(found)
+    assert abs(found.whole) < 0.05 and "of each contact" not in surface_text(found)
+
+
+def test_a_brightness_of_each_contact_is_that_of_bodies_that_differ():
+    """Of 1 % from ball to ball and 1 % from pixel to pixel, balls have half; of 36 balls to 5 %, in two thirds."""
+    rows, columns = (np.floor(a / PITCH).astype(int) for a in (ROWS, COLUMNS))
+    own = 0.01 * np.random.default_rng(3).standard_normal((6, 6))[rows, columns]
+    found = by_surface(*(case := session(lambda k: own + texture(0) / 2))[:1], None, *case[1:])
+    drawn = np.std(own[::PITCH, ::PITCH])
+    assert found.whole_rms == pytest.approx(drawn, rel=0.15)
+    assert found.whole == pytest.approx(drawn**2 / (drawn**2 + 0.01**2), abs=0.12)
+    assert "one brightness of each contact" in surface_text(found)
 
 
 @pytest.mark.parametrize(
