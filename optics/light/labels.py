@@ -236,24 +236,32 @@ def project(camera, points: np.ndarray) -> np.ndarray:
 
     width, height = camera.resolution
 
-    def directions(uv):
+    def rays(uv):
         with dr.suspend_grad():
             origin, d = camera.ray(*(mi.Float(uv[:, i].astype(np.float32)) for i in (0, 1)))
-        return np.array(origin, float).T[:1], np.array(d, float).T
+        return np.array(origin, float).T, np.array(d, float).T
+
+    def towards(origin, at):
+        """Directions of points from where rays start."""
+        way = at - origin
+        return way / np.linalg.norm(way, axis=-1, keepdims=True)
+
+    def off(uv):
+        """How far the rays' directions are from those of the points."""
+        origin, d = rays(uv)
+        return d - towards(origin, points)
 
     u, v = np.meshgrid(np.linspace(0, width, 17), np.linspace(0, height, 17))
     grid = np.stack([u.ravel(), v.ravel()], -1)
-    origin, rays = directions(grid)
-    wanted = points - origin
-    wanted /= np.linalg.norm(wanted, axis=-1, keepdims=True)
-    uv = grid[np.argmax(np.nan_to_num(wanted @ rays.T, nan=-1.0), axis=1)]
+    cosines = np.stack([np.nan_to_num(towards(o, points) @ d, nan=-1.0) for o, d in zip(*rays(grid))], 1)
+    uv = grid[np.argmax(cosines, axis=1)]
     for _ in range(NEWTON):
-        here, right, down = (directions(uv + shift)[1] for shift in ((0, 0), (STEP, 0), (0, STEP)))
+        here, right, down = (off(uv + shift) for shift in ((0, 0), (STEP, 0), (0, STEP)))
         slope = np.stack([right - here, down - here], -1) / STEP
         square = np.swapaxes(slope, 1, 2) @ slope
-        off = np.swapaxes(slope, 1, 2) @ (wanted - here)[..., None]
-        uv = np.clip(uv + np.linalg.solve(square, off)[..., 0], (-width, -height), (2 * width, 2 * height))
-    apart = np.linalg.norm(directions(uv)[1] - wanted, axis=-1)
+        step = np.swapaxes(slope, 1, 2) @ here[..., None]
+        uv = np.clip(uv - np.linalg.solve(square, step)[..., 0], (-width, -height), (2 * width, 2 * height))
+    apart = np.linalg.norm(off(uv), axis=-1)
     pixel = np.linalg.norm(slope, axis=1).min(-1)
     inside = (uv >= 0).all(-1) & (uv <= (width, height)).all(-1) & (apart < 0.05 * pixel)
     return np.where(inside[:, None], uv, np.nan)

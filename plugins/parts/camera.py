@@ -16,10 +16,13 @@ view. Frame: x right, y down, z forward (OpenCV); the transform `to_world` gives
 departs from it. Rays of plain Mitsuba start on the entrance pupil, a disc of the area `pupil_area` across the axis, and
 meet where the ray through its middle is `focus` from the camera along the axis; so do those of images LED by LED in
 scenes full of beads, and other images are blurred as the effect "defocus" says.
+Over a gel, `telecentricity` t turns rays towards the axis where they leave the untouched face, z = 0, which keeps its
+scale: a ray that the pinhole at the distance Z sends along (x, y, 1) starts at (x, y, 0) t Z and runs along ((1 - t) x,
+(1 - t) y, 1), as if the camera stood at Z/(1 - t).
 Fingerprint
     principal point and pose shift the image; distortion grows with the third power of the radius; exposure scales all.
 Validity
-    central projection; a fisheye is the part `fisheye`. Monotone response: G'(m) > 0 on [0, 1].
+    central projection but for `telecentricity`; a fisheye is the part `fisheye`. Monotone response: G' > 0 on [0, 1].
 References
     F-TAC Hand supplementary information, S1.1, eq. (S1); Mitsunaga & Nayar, CVPR 1999.
 XML
@@ -103,6 +106,17 @@ PARAMETERS = (
     Parameter("pan", "deg", 0.0, (-80.0, 80.0), "turn about the y axis", plausible=0.5, how="difference", step=0.2),
     Parameter("tilt", "deg", 0.0, (-80.0, 80.0), "turn about the x axis", plausible=0.5, how="difference", step=0.2),
     Parameter("roll", "deg", 0.0, (-180.0, 180.0), "turn about the z axis", plausible=0.5, how="difference", step=0.8),
+    Parameter(
+        "telecentricity",
+        "1",
+        0.0,
+        (-4.0, 2.0),
+        "t: share of the perspective over a gel that the lens does not have; 1: telecentric",
+        neutral=0.0,
+        plausible=0.2,
+        how="difference",
+        step=0.8,
+    ),
     Parameter(
         "pupil_area",
         "mm^2",
@@ -204,6 +218,7 @@ def build():
         sampled = False  # whether images LED by LED are made of rays that start all over the pupil
         bands = 3  # of the scene
         clock = ""  # key of the scene's clock
+        away = 0.0  # mm along the axis from the nominal pose to the untouched face of a gel; 0 without one
 
         def __init__(self, props):
             nominal = props.get("to_world", mi.ScalarAffineTransform4f())
@@ -243,12 +258,17 @@ def build():
             self.bands = len(getattr(scene.integrator, "bands", ())) or 1
             clocks = [f"{p.name}.{n}" for p in scene.parts for n, q in p.numbers.items() if q.role == "clock"]
             self.clock = clocks[0] if clocks else ""
+            forward = np.array(self.columns[2]).ravel()[2]
+            if any(p.kind == "gel" for p in scene.parts) and forward > 0:
+                self.away = max(float(-np.array(self.columns[3]).ravel()[2] / forward), 0.0)
 
         def takes(self, name):
             idle = ["detector" if self.mosaic else "site"]  # behind an analyser a pixel meets one polarization
             if self.bands == 1 and self.integral is None:  # of one band a sensitivity is a gain
                 idle.append("sensitivity")
             if not self.clock and self.numbers[name].through == "clock":
+                return False
+            if not self.away and name == "telecentricity":
                 return False
             return not any(
                 name in effect.parameter_names for stage in idle for effect in self.registry.at_stage(self.kind, stage)
@@ -300,9 +320,12 @@ def build():
             width, height = self.resolution
             x, y = self.undistort((u - width / 2 - self.principal_x) / fx, (v - height / 2 - self.principal_y) / fy)
             origin = self.columns[3] + self.to_world(mi.Vector3f(self.x, self.y, self.z))
-            return mi.Point3f(origin) + dr.zeros(mi.Point3f, dr.width(u)), self.turned(
-                dr.normalize(mi.Vector3f(x, y, 1))
-            )
+            start = mi.Point3f(origin) + dr.zeros(mi.Point3f, dr.width(u))
+            if not self.away:
+                return start, self.turned(dr.normalize(mi.Vector3f(x, y, 1)))
+            aside, less = self.away * self.telecentricity, 1 - self.telecentricity
+            start += self.turned(mi.Vector3f(x * aside, y * aside, 0))
+            return start, self.turned(dr.normalize(mi.Vector3f(x * less, y * less, 1)))
 
         # -- how images are developed: numpy; `own` has the parameters as numbers, complex ones for derivatives -----
 

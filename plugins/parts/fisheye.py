@@ -44,7 +44,7 @@ from optics.scene.declare import Part
 from optics.scene.parameter import Parameter
 from optics.scene.registry import declared, known
 
-PINHOLE = ("x_fov", "k1", "k2", "k3", "p1", "p2")
+PINHOLE = ("x_fov", "k1", "k2", "k3", "p1", "p2", "telecentricity")
 PARAMETERS = (
     Parameter(
         "law",

@@ -110,14 +110,21 @@ def test_an_elastic_dent_is_the_skin_that_forces_are_of():
     assert moved[2].max() > 0.8
 
 
-def test_a_fisheye_is_turned_around_as_its_law_says():
-    camera = scenes.load("particle_gel", {"width": "96", "height": "96", "beads": "10"}).camera
+@pytest.mark.parametrize("lens", ["fisheye", "pinhole", "telecentric"])
+def test_a_camera_is_turned_around_as_its_law_says(lens):
+    if lens == "fisheye":
+        camera = scenes.load("particle_gel", {"width": "96", "height": "96", "beads": "10"}).camera
+    else:
+        scene = scenes.load("gelsight", {"width": "96", "height": "96"})
+        camera = scene.camera
+        scene.set({"camera.telecentricity": 1.0 if lens == "telecentric" else 0.0})
     rng = np.random.default_rng(0)
     pixel = rng.uniform(5, 90, (40, 2))
     import mitsuba as mi
 
-    origin, direction = camera.ray(*(mi.Float(pixel[:, i].astype("f")) for i in (0, 1)))
-    points = np.array(origin).T + 7.0 * np.array(direction).T
+    origin, direction = (np.array(a).T for a in camera.ray(*(mi.Float(pixel[:, i].astype("f")) for i in (0, 1))))
+    assert (np.ptp(direction, axis=0).max() < 1e-6) == (lens == "telecentric") == (np.ptp(origin, axis=0).max() > 1e-3)
+    points = origin + rng.uniform(7.0, 20.0, (40, 1)) * direction
     found = labels.project(camera, points)
     whole = np.isfinite(found).all(1)
     assert whole.sum() > 20
