@@ -375,7 +375,12 @@ class Study:
         return self._verdict
 
     def add(
-        self, effect: str, *, drop: Sequence[str] = (), start: Values | None = None, progress: Progress | None = None
+        self,
+        effect: str,
+        *,
+        drop: str | Sequence[str] = (),
+        start: Values | None = None,
+        progress: Progress | None = None,
     ) -> Fit:
         """Free an effect, calibrate everything again, and record it as the next step.
 
@@ -388,7 +393,7 @@ class Study:
         """
         model = self.model
         chosen = model.scene.registry.find_effect(effect)
-        dropped = [model.scene.registry.find_effect(name) for name in drop]
+        dropped = list({e.key: e for e in map(model.scene.registry.find_effect, _listed(drop) or ())}.values())
         for other in dropped:
             if other.key not in self.record.added():
                 raise ValueError(

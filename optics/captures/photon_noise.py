@@ -31,6 +31,7 @@ SMOOTH = 5  # px, side of the squares over which the level is a mean
 LAPLACIAN = np.outer([1, -2, 1], [1, -2, 1]) / 6
 MIDDLE = 1200  # px, side of the middle of a picture that is looked at: a million pixels tell enough
 LEVELS, ENOUGH = 16, 100  # groups along each level, and the pixels that one has at least
+WIDE = 1.5  # times the lowest level that the highest is at least: a line over less says nothing of where it ends
 OF_GAUSSIAN = 0.4549  # median of a squared Gaussian of variance 1
 CERTAIN = 3.0  # standard deviations above 0 of a black level that is believed
 
@@ -96,6 +97,8 @@ def _ending(pair: Sequence[tuple[np.ndarray, np.ndarray]], top: float, step: flo
     if len(groups) < LEVELS:
         return None
     levels = np.array([(s1[g].mean(), s2[g].mean()) for g in groups])
+    if levels.max() < WIDE * levels.min():
+        return None
     design = np.stack(
         [(1 / levels).sum(1), (1 / levels**2).sum(1), np.ones(len(groups)), np.diff(1 / levels)[:, 0] ** 2], 1
     )

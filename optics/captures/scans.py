@@ -478,6 +478,17 @@ def import_scans(
     bin = max(min(BIN, most), 1) if bin is None else bin
     if not 1 <= int(bin) == bin <= most:
         raise BadCapture(f"{source}: bin = {bin}; allowed: whole numbers from 1 to {most}")
+    if black_level is not None and not 0 <= black_level < saturation:
+        raise BadCapture(
+            f"--black-level {black_level:g} DN; allowed: 0 or more and below saturation, {saturation:g} DN: the mean "
+            "of an image with the lens covered"
+        )
+    darkest = min(float(np.median(i)) for i in flat.images)
+    if black_level is not None and black_level >= darkest:
+        raise BadCapture(
+            f"--black-level {black_level:g} DN: {flat.name}, the flat field, has no more than {darkest:g} DN under one "
+            "of the LEDs; allowed: less, the mean of an image with the lens covered"
+        )
     scale, warnings = first.mm_per_pixel * bin, list(read.unused)
     steps = len(scans) + 1
     tick("import", 0, steps)
@@ -546,7 +557,9 @@ def import_scans(
     corrections = _corrections(bin, masked)
     if told:
         text = f"{told.black_level:.3g} +- {told.sd:.2g} DN, where the line of photon noise against signal ends"
-        corrections.append(correction("a black level that nobody stated is subtracted", text, "all images"))
+        corrections.append(
+            correction("a black level that nobody stated is written to captures.toml", text, "all images")
+        )
     if max(dark) > 0:
         remark, entry = black_text(black, [float(np.mean(dark))])
         warnings.append(remark)
@@ -559,7 +572,7 @@ def import_scans(
             pose |= {f"gel.{key}": pose.get(f"gel.{key}", 0.0) for key in STRETCH}
     facts = _facts(source, scans, flat, plates, motions, bin, scale, shape, noise, lights, warnings)
     facts["corrections"] = corrections
-    facts["black_level"] = _pedestal(black_level, told)
+    facts["black_level"] = _pedestal(black_level, told, black != [None])
     if read.mapped:
         facts["heightmaps"] = [scan.name for scan in read.mapped]
         facts["setup"]["held_out"] = [scan.name for scan in read.mapped]
@@ -706,12 +719,12 @@ def _facts(
     }
 
 
-def _pedestal(given: float | None, told: PhotonNoise | None) -> dict[str, Any]:
+def _pedestal(given: float | None, told: PhotonNoise | None, cut_off: bool) -> dict[str, Any]:
     """The black level that was written, and where it is from."""
     if given is not None:
         return {"DN": given, "by": "given"}
     if told is None:
-        return {"DN": 0.0, "by": "assumed"}
+        return {"DN": 0.0, "by": "values are cut off below" if cut_off else "assumed"}
     return {"DN": round(told.black_level, 2), "sd_DN": round(told.sd, 2), "by": "photon noise"}
 
 
@@ -824,15 +837,15 @@ def readme(facts: Mapping) -> str:
 def _of_pedestal(fact: Mapping[str, Any]) -> str:
     if fact["by"] == "given":
         return f"{fact['DN']:g} DN, given"
-    if fact["by"] == "assumed":
+    if fact["by"] != "photon noise":
+        why = "the noise of the images tells none" if fact["by"] == "assumed" else fact["by"]
         return (
-            "0 DN, assumed: the noise of the images tells none; take an image with the lens covered and import again "
-            "with '--black-level' its mean"
+            f"0 DN, assumed: {why}; take an image with the lens covered and import again with '--black-level' its mean"
         )
     return (
-        f"{fact['DN']:.3g} DN, to {fact['sd_DN']:.2g} DN: there the line of photon noise against signal ends. Dark "
-        "noise of r DN makes it r^2/K too low, with K DN of variance per DN of light; an image with the lens covered "
-        "is better: give its mean as '--black-level'"
+        f"{fact['DN']:.3g} +- {fact['sd_DN']:.2g} DN, where the line of photon noise against signal ends. Dark noise "
+        "of r DN makes it r^2/K too low, with K DN of variance per DN of light. Better: take an image with the lens "
+        "covered and give its mean as '--black-level'"
     )
 
 

@@ -31,7 +31,7 @@ from optics.diagnosis.explanations import Outcome
 from optics.diagnosis.findings import basis_of, findings_of, followed, subject_of
 from optics.diagnosis.laws import other_laws
 from optics.diagnosis.refit import COARSE, Case, Cooled, Expected, after_at, refit_each
-from optics.diagnosis.result import Basis, Diagnosis, Family, Fingerprint, Level, Row, Split, kinds_of
+from optics.diagnosis.result import NAMED, Basis, Diagnosis, Family, Fingerprint, Level, Row, Split, kinds_of
 from optics.diagnosis.score import score
 from optics.diagnosis.text import leaves_misfit, sentence
 from optics.diagnosis.thresholds import CLEAR, EXCESS, LEVEL, MARGIN, MAX_SPLIT, SHARE, close
@@ -193,7 +193,7 @@ def diagnose(
         ambiguous.append(findings.fragile)
         kinds.append([findings.fragile])
     hints = remarks.hints_of(word, conditions, outcome, findings, gaps, names)
-    if subject:
+    if subject and word in NAMED:
         hints = [*remarks.replaced(case, best, added), *hints]
     text = sentence(word, conditions, findings, rows, told, fingerprints, levels, shifts, basis)
     text = " ".join(filter(None, [text, remarks.lamp_text(case, outcome, basis)]))

@@ -232,7 +232,7 @@ def surface_text(found: Surface) -> str:
     )
     if found.whole > SHARE:
         text += (
-            f" {min(found.whole, 1.0):.0%} of that is one brightness of each contact ({found.whole_rms:.1%} rms): the "
-            "bodies that press differ, in what they reflect or in how deep they press."
+            f" {min(found.whole, 1.0):.0%} of that is one brightness of each contact ({found.whole_rms:.1%} rms): they "
+            "differ in what the body reflects, or in how deep it presses."
         )
     return text

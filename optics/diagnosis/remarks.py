@@ -224,30 +224,33 @@ def lamp_text(case: Case, outcome: Outcome, basis: Basis) -> str:
 
 
 def replaced(case: Case, best: Trial, added: Sequence[Effect]) -> list[str]:
-    """A sentence for each effect, added before, of which the best explanation leaves nothing certain.
+    """A sentence where the best explanation leaves nothing of effects that were added before.
 
-    Its strengths were CERTAIN errors from neutral, and are within NOTHING_LEFT errors of it, or at a tenth of what they
-    were."""
-    before = {v.name: float(s) for v, s in zip(case.fit.variables, case.fit.sd)}
-    after = {v.name: float(s) for v, s in zip(best.fit.variables, best.fit.sd)}
-    model, told = case.model, []
+    Their strengths were CERTAIN errors from neutral. They are at a tenth of that, or at a quarter of it and within
+    NOTHING_LEFT errors of neutral."""
+    sd = [{v.name: float(s) for v, s in zip(fit.variables, fit.sd)} for fit in (case.fit, best.fit)]
+    gone: dict[str, list[str]] = {}
     for effect in added:
         names = {v.name for v in case.variables_of(effect)}
-        told_by = []
-        for v in (v for v in case.fit.variables if v.name in names and v.name in after):
+        own = []
+        for v in (v for v in case.fit.variables if v.name in names and v.name in sd[1]):
+            was, now = (value_of(case.model, fit.values, v) for fit in (case.fit, best.fit))
             neutral = v.parameter.neutral
-            was, now = value_of(model, case.fit.values, v), value_of(model, best.fit.values, v)
-            if neutral is not None and abs(was - neutral) > CERTAIN * before[v.name]:
-                gone = abs(now - neutral) < max(NOTHING_LEFT * after[v.name], abs(was - neutral) / 10)
-                told_by.append((gone, f"{v.name} {was:.3g} -> {now:.2g}{spaced(v.parameter.unit)}"))
-        if told_by and all(gone for gone, _ in told_by):
-            names_of = [c.effect.name for c in best.members]
-            told.append(
-                f"{' and '.join(names_of)} takes the place of {effect.name}, which was added before "
-                f"({', '.join(text for _, text in told_by)}): calibrate without it (optics add STUDY '{names_of[0]}' "
-                f"--drop '{effect.name}'), and compare the held-out frames"
-            )
-    return told
+            if neutral is not None and (there := abs(was - neutral)) > CERTAIN * sd[0][v.name]:
+                left = max(min(NOTHING_LEFT * sd[1][v.name], there / 4), there / 10)
+                own.append((abs(now - neutral) < left, f"{v.name} {was:.3g} -> {now:.2g}{spaced(v.parameter.unit)}"))
+        if own and all(found for found, _ in own):
+            gone[effect.name] = [text for _, text in own]
+    if not gone:
+        return []
+    *first, last = (c.effect.name for c in best.members)
+    commands = [f"optics add STUDY '{name}'" for name in first]
+    commands.append(" ".join([f"optics add STUDY '{last}'", *(f"--drop '{name}'" for name in gone)]))
+    return [
+        f"with {' and '.join([*first, last])} nothing is left of {' and '.join(gone)}, added before "
+        f"({some([text for texts in gone.values() for text in texts], 3)}): one stands in for the other; compare the "
+        f"held-out frames without it ({'; '.join(commands)})"
+    ]
 
 
 def hints_of(

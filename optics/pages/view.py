@@ -140,7 +140,9 @@ class View:
         self.held = sorted(set(range(len(self.model.frames))) - set(self.fitted))
         sd = {v["name"]: v["sd"] for v in self.step["variables"]}
         added = self.study.added(self.step["index"])
-        known = (*loop.candidates(self.model, self.study), *loop.effects_of(self.study, self.model.scene.registry))
+        registry = self.model.scene.registry
+        known = (*loop.candidates(self.model, self.study), *loop.effects_of(self.study, registry))
+        known += tuple(registry.find_effect(key) for key in added)  # dropped since, and maybe excluded
         self.effects = {e.key: e for e in sorted(known, key=lambda e: e.key)}
         own = {
             key: {k for keys in self.model.scene.keys_of(e).values() for k in keys} for key, e in self.effects.items()

@@ -285,12 +285,16 @@ class Values:
             for index in variable.frames:
                 self.frame.setdefault(index, {}).update({key: float(value) for key in variable.keys})
 
-    def without(self, variables: Iterable[Variable]) -> Values:
-        """These but for the variables', which have the values of scene and captures again, in held-out frames too."""
+    def without(self, variables: Iterable[Variable], given: Mapping[str, Any]) -> Values:
+        """These but for the variables', in held-out frames too: they have what is `given` by key, else the values of
+        scene and captures."""
         common = {key for v in variables if v.frames is None for key in v.keys}
         own = {key for v in variables if v.frames is not None for key in v.keys}
         return Values(
-            {key: value for key, value in self.common.items() if key not in common},
+            {
+                **{key: value for key, value in self.common.items() if key not in common},
+                **{key: value for key, value in given.items() if key in common | own},
+            },
             {i: {key: value for key, value in at.items() if key not in own} for i, at in self.frame.items()},
         )
 

@@ -468,6 +468,26 @@ def _freed_as_in(model: SceneModel, held: Sequence[Variable]) -> Callable[[Any, 
     return freed
 
 
+def _without(
+    record: Record, model: SceneModel, setup: Setup, found: Fit, dropped: Sequence[Effect], fitted: Sequence[int]
+) -> tuple[list[Variable], list[Variable]]:
+    """The variables of a model without effects that were added before, and those that it loses.
+
+    Raises ValueError for an effect of which nothing would go, as another one has its parameters too."""
+    gone = {e.key for e in dropped}
+    staying = _variables(model, setup, fitted, [key for key in record.added() if key not in gone])
+    names = {v.name for v in staying}
+    leaving = [v for v in found.variables if v.name not in names]
+    for effect in dropped:
+        own = {v.name for v in effect_variables(model, effect)}
+        if not any(v.name in own for v in leaving):
+            raise ValueError(
+                f"{record.folder}: dropping '{effect.name}' would change nothing: what it frees belongs to the rest of "
+                "the model as well; drop that too, or start another study"
+            )
+    return staying, leaving
+
+
 # -- add -------------------------------------------------------------------------------------------------------------
 def extend(
     record: Record,
@@ -518,11 +538,9 @@ def _extended(
         )
     staying, values = list(found.variables), found.values
     if dropped:
-        keys = {e.key for e in dropped}
-        names = {v.name for v in _variables(model, setup, fitted, [k for k in record.added() if k not in keys])}
-        leaving = [v for v in staying if v.name not in names]
-        staying = [v for v in staying if v.name in names]
-        values, start = values.without(leaving), start and start.without(leaving)
+        staying, leaving = _without(record, model, setup, found, dropped, fitted)
+        values = values.without(leaving, setup.values)
+        start = None if start is None else start.without(leaving, setup.values)
     extra = _of_fitted(effect_variables(model, effect, staying), fitted)
     if not extra:
         why = "no frame can show it" if not effect_variables(model, effect) else "the model solves for all of it"
@@ -557,7 +575,12 @@ def _extended(
         record.note_inputs({name: h for name, h in own.items() if h == digest})
     comparison = write_step(record, model, effect, best, held, time.perf_counter() - clock, dropped)
     before, after = (step["held_out"]["chi2_per_dof"] if step["held_out"] else math.nan for step in record.steps[-2:])
-    if after > before:
+    if after > before and dropped:
+        best.warnings.append(
+            f"held-out chi2/dof rises from {before:.4g} to {after:.4g} with {effect.name} in place of "
+            f"{' and '.join(e.name for e in dropped)}: what was dropped predicts the held-out frames better"
+        )
+    elif after > before:
         best.warnings.append(
             f"held-out chi2/dof rises from {before:.4g} to {after:.4g} with {effect.name}: it does not predict the "
             "held-out frames, so it is not the cause, or not the only one"

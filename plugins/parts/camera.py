@@ -351,7 +351,10 @@ def build():
             """px in the image by which a ray misses the one through the pupil's middle, per mm between the two on the
             pupil; of what is `slant` mm from the camera (infinite: nothing)."""
             x, y, focal = self.normalised(own, u, v)
-            return focal * math.sqrt(np.real(own.aspect)) * (1 / own.focus - np.sqrt(1 + x**2 + y**2) / slant)
+            t = np.real(own.telecentricity) if self.away else 0.0
+            inverse = np.sqrt(1 + (1 - t) ** 2 * (x**2 + y**2)) / slant  # of the depth along the axis
+            scale = focal * math.sqrt(np.real(own.aspect)) / np.maximum(1 - t + t * self.away * inverse, 1e-6)
+            return scale * (1 / own.focus - inverse)
 
         def gains(self, own, channels):
             """(channels,) gain of each channel in the frame."""

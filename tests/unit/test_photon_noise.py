@@ -35,12 +35,12 @@ def pictures(rng, pedestal, dark=0.2, **options):
 
 @pytest.mark.parametrize("pedestal", [8.0, 16.0])
 def test_the_black_level_is_where_photon_noise_ends(pedestal):
-    """Two scenes. Dark noise of .2 DN takes 1.6 DN off, .04/K; the gain is that of the camera."""
-    rng = np.random.default_rng(4)
-    found = photon_noise([pictures(rng, pedestal) for _ in range(2)], 255.0)
-    assert found.black_level == pytest.approx(pedestal - 0.2**2 / GAIN, abs=3 * found.sd)
-    assert found.sd < 0.25 * pedestal
-    assert found.system_gain == pytest.approx(GAIN, rel=0.1)
+    """Mean of four sets of one scene. Dark noise of .2 DN takes 1.6 DN off, .04/K; of forty such sets the mean was .6
+    DN above that, and they scattered by .6 DN."""
+    found = [photon_noise([pictures(np.random.default_rng(seed), pedestal)], 255.0) for seed in range(4)]
+    assert np.mean([f.black_level for f in found]) == pytest.approx(pedestal - 0.2**2 / GAIN, abs=1.5)
+    assert 0.3 < np.mean([f.sd for f in found]) < 1.6
+    assert np.mean([f.system_gain for f in found]) == pytest.approx(GAIN, rel=0.05)
 
 
 @pytest.mark.parametrize("grain", [0.0, 0.05])

@@ -27,7 +27,8 @@ def fit(haze, sd):
         (0.8, 0.02, 0.07, 0.001, True),  # less than a tenth of it
         (0.8, 0.02, 0.3, 0.02, False),
         (0.8, 0.3, 0.01, 0.3, False),  # was never certain
-        (0.8, 0.02, 0.3, 0.2, True),  # not told from nothing any more
+        (0.8, 0.02, 0.3, 0.2, False),  # not told from nothing any more, and maybe there
+        (0.8, 0.02, 0.15, 0.06, True),
     ],
 )
 def test_an_effect_is_replaced_where_nothing_is_left_of_it(before, sd_before, after, sd_after, gone):
@@ -39,8 +40,15 @@ def test_an_effect_is_replaced_where_nothing_is_left_of_it(before, sd_before, af
     said = replaced(case, best, [HAZE])
     assert bool(said) == gone
     if said:
-        assert (
-            f"glare takes the place of haze, which was added before (gel.haze {before:.3g} -> {after:.2g})" in said[0]
-        )
-        assert "optics add STUDY 'glare' --drop 'haze'" in said[0]
+        assert f"with glare nothing is left of haze, added before (gel.haze {before:.3g} -> {after:.2g})" in said[0]
+        assert "(optics add STUDY 'glare' --drop 'haze')" in said[0]
     assert replaced(case, best, []) == []
+
+
+def test_a_pair_that_replaces_something_is_added_one_by_one():
+    case = SimpleNamespace(
+        model=SimpleNamespace(base={"gel.haze": 0.0}), fit=fit(0.8, 0.02), variables_of=lambda effect: [OWN]
+    )
+    two = [SimpleNamespace(effect=SimpleNamespace(name=name)) for name in ("glare", "tilt")]
+    (said,) = replaced(case, SimpleNamespace(fit=fit(0.0, 0.02), members=two), [HAZE])
+    assert "(optics add STUDY 'glare'; optics add STUDY 'tilt' --drop 'haze')" in said

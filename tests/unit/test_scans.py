@@ -124,6 +124,9 @@ def test_a_pedestal_is_found_in_the_noise_unless_it_is_given(imported, tmp_path,
     assert capture_set.load(found.folder).noise.black_level == told["DN"]
     assert any("black level" in c["what"] for c in found.facts["corrections"])
     assert found.facts["light_azimuths_deg"] == pytest.approx(AZIMUTHS, abs=1.0)
+    for wrong, said in ((300.0, "below saturation, 255 DN"), (-5.0, "0 or more"), (125.0, "flat, the flat field")):
+        with pytest.raises(BadCapture, match=said):
+            scans.import_scans(tmp_path / "in", tmp_path / "out2", bin=4, black_level=wrong)
     given = scans.import_scans(tmp_path / "in", tmp_path / "out2", bin=4, black_level=11.0)
     assert given.facts["black_level"] == {"DN": 11.0, "by": "given"}
     assert capture_set.load(given.folder).noise.black_level == 11.0

@@ -6,6 +6,7 @@ import pytest
 import optics
 from optics.captures.noise import Noise
 from optics.errors import UnknownKey
+from optics.pages.view import View
 from optics.proof.makers import bench as jones
 
 LEAK, READINGS = 0.02, 96
@@ -33,11 +34,11 @@ def astray(tmp_path_factory):
 def test_an_effect_that_stood_in_for_another_is_named_and_dropped(astray):
     verdict = astray.diagnose(advised=False)
     assert verdict.ambiguous == ["extinction leak", "depolarization"], verdict.sentence  # one law, at every setting
-    (told,) = [hint for hint in verdict.hints if "takes the place of" in hint]
+    (told,) = [hint for hint in verdict.hints if "nothing is left of" in hint]
     best = verdict.explanations[0].effects[0]
-    assert f"{best} takes the place of stray light, which was added before (camera.stray " in told
+    assert f"with {best} nothing is left of stray light, added before (camera.stray " in told
     assert f"optics add STUDY '{best}' --drop 'stray light'" in told
-    found = astray.add("extinction leak", drop=["stray light"])
+    found = astray.add("extinction leak", drop="stray light")
     assert astray.effects == ["extinction leak"] and "stray light" in [e.name for e in astray.candidates()]
     assert "camera.stray" not in {*found.values.common, *(v.name for v in found.variables)}
     assert astray.record.steps[-1]["fitted"]["chi2_per_dof"] == pytest.approx(1.0, abs=4 * np.sqrt(2 / READINGS))
@@ -45,6 +46,7 @@ def test_an_effect_that_stood_in_for_another_is_named_and_dropped(astray):
     assert again.effects == ["extinction leak"] and "+ extinction leak without stray light" in again.table()
     assert again.record.added(1) == ["stray-light"] and again.record.added(0) == []
     assert again.fit.values.common == pytest.approx(found.values.common, rel=1e-6)
+    assert View(astray.folder, step=1).step["name"] == "stray light"
 
 
 def test_only_what_was_added_can_be_dropped(astray):
