@@ -20,6 +20,7 @@ References
     light); the neglect of S1.5: light that reaches the face once.
 """
 
+import math
 from types import SimpleNamespace
 
 import numpy as np
@@ -39,11 +40,26 @@ def fill(path, gel):
     distance = dr.norm(to_led)
     to_led /= distance
     irradiance = path.led.radiance(middle, to_led, distance) * dr.maximum(-to_led.z, 0.0)
-    scattered = mi.unpolarized_spectrum(path.si.bsdf().eval_diffuse_reflectance(path.si)) * dr.inv_pi
+    scattered = along_the_normal(path.si, gel.coats)
     kept = mi.UnpolarizedSpectrum(1.0)
     for function in gel.functions("segment"):
         kept *= function(gel.path(path.p, path.camera, path.p, path.led, path.si), gel)
     return scattered * irradiance * kept * gel.returned
+
+
+def along_the_normal(si, coats):
+    """Radiance per irradiance along the normal. Membranes are asked one by one: Dr.Jit cannot follow the derivative by
+    a roughness through a second call of what a surface points to."""
+    import drjit as dr
+    import mitsuba as mi
+
+    normal = mi.Vector3f(0.0, 0.0, 1.0)
+    if not coats:
+        return mi.unpolarized_spectrum(si.bsdf().eval(mi.BSDFContext(), si, normal, si.is_valid()))
+    found = mi.UnpolarizedSpectrum(0.0)
+    for coat in coats:
+        found += dr.select(si.bsdf() == mi.BSDFPtr(coat), coat.brdf(si, normal), 0.0)
+    return found
 
 
 def check_share():
@@ -52,7 +68,8 @@ def check_share():
     import mitsuba as mi
 
     lamp = mi.Point3f(3.0**0.5, 0.0, -1.0)
-    face = SimpleNamespace(bsdf=lambda: SimpleNamespace(eval_diffuse_reflectance=lambda si: mi.Spectrum(0.5)))
+    material = SimpleNamespace(eval=lambda ctx, si, wo, active: mi.Spectrum(0.5) * (wo.z / math.pi))
+    face = SimpleNamespace(bsdf=lambda: material, is_valid=lambda: mi.Bool(True))
     led = SimpleNamespace(radiance=lambda point, to_led, distance: mi.UnpolarizedSpectrum(2.0))
     path = SimpleNamespace(
         lamp=lamp,
@@ -63,7 +80,10 @@ def check_share():
         wavelengths=mi.Color0f() if not mi.is_spectral else mi.UnpolarizedSpectrum(540.0),
     )
     gel = SimpleNamespace(
-        returned=mi.Float(0.4), functions=lambda stage: [lambda path, gel: 0.9], path=lambda *ends: SimpleNamespace()
+        returned=mi.Float(0.4),
+        functions=lambda stage: [lambda path, gel: 0.9],
+        path=lambda *ends: SimpleNamespace(),
+        coats=(),
     )
     agree(np.array(fill(path, gel)).ravel(), 0.4 * 0.9 * 0.5 / np.pi * 2 * 0.5, 1e-5)
 

@@ -362,6 +362,7 @@ def build():
 
         def wire(self, scene):
             self.carries = any(getattr(part, "moved_by", None) == self.role for part in scene.parts)
+            self.coats = tuple(part for part in scene.parts if hasattr(part, "brdf"))  # membranes
 
         def takes(self, name):
             if self.elastic:

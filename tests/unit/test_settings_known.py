@@ -451,6 +451,9 @@ class Fresh:
 
     steps: list = []
 
+    def added(self):
+        return []
+
 
 def ruled_out(model, without=()):
     from optics.study import loop

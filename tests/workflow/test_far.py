@@ -147,7 +147,8 @@ def test_an_effect_that_does_not_predict_is_reported_as_no_cause(monkeypatch):
     scene = SimpleNamespace(can_express=lambda effect: True, keys_of=lambda effect: {})
     model = SimpleNamespace(scene=scene, captures=captures, dialled=False, frames=[], where_used=nullcontext)
     effect = SimpleNamespace(name="row curve", file="", requires=(), part="camera")
-    found, _ = loop.extend(study, model, SimpleNamespace(robust=False), SimpleNamespace(variables=[]), effect, Values())
+    before = SimpleNamespace(variables=[], values=Values())
+    found, _ = loop.extend(study, model, SimpleNamespace(robust=False), before, effect, Values())
     assert found.warnings == [
         "held-out chi2/dof rises from 1.5 to 1.6 with row curve: it does not predict the "
         "held-out frames, so it is not the cause, or not the only one"
