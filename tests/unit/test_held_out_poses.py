@@ -26,3 +26,17 @@ def test_a_resumed_study_records_the_poses_found_in_this_step(monkeypatch):
     for values in (seen["shown"], seen["kept"]):
         assert values.frame == {0: {"gel.press_x": 1.1}, 1: {"gel.press_x": 2.7}}
         assert values.common == {"camera.blur": 0.5}
+
+
+def test_values_without_some_variables_have_what_was_given_again():
+    """A strength that the study was begun with comes back; what a frame has of its own goes, in held-out frames too."""
+    glare, gain = (
+        SimpleNamespace(keys=(key,), frames=frames) for key, frames in (("camera.glare", None), ("camera.gain", (0,)))
+    )
+    now = Values(
+        {"camera.glare": 0.3, "led.x": 1.0}, {0: {"camera.gain": 1.1, "gel.press_x": 2.0}, 1: {"camera.gain": 0.9}}
+    )
+    left = now.without([glare, gain], {"camera.glare": 0.1, "led.x": 7.0})
+    assert left.common == {"led.x": 1.0, "camera.glare": 0.1}
+    assert left.frame == {0: {"gel.press_x": 2.0}, 1: {}}
+    assert "camera.glare" not in now.without([glare], {}).common and now.common["camera.glare"] == 0.3
