@@ -303,7 +303,9 @@ class Study:
     @property
     def effects(self) -> list[str]:
         """Names of the effects that were added and not dropped, in their order."""
-        return [e.name for e in loop.effects_of(self.record, self.model.scene.registry)]
+        steps = {step["effect"]: step for step in self.record.steps}
+        names = {k: s["name"].rsplit(" without ", 1)[0] if s.get("dropped") else s["name"] for k, s in steps.items()}
+        return [names[key] for key in self.record.added()]
 
     @property
     def model(self) -> SceneModel:
