@@ -4,10 +4,10 @@ Definition
     var S = K (S - b) + q^2/12                                   photon transfer, as in `optics.captures.noise`
     D = I_1/S_1 - I_2/S_2                                        two pictures of one scene under two lights
     E (L D)^2 = sum over both of (K (S - b) + q^2/12)/S^2 + t^2 + (p b)^2 (1/S_1 - 1/S_2)^2
-with the images I, their smooth level S, DN, the step q between values, and the Laplacian L,
-whose squared weights add up to 1. A pattern p of the scene's own is in both pictures: D has left of it what the black
-level makes of it, and t what the lights do. All but q come of least squares over groups of pixels of about the same S_1
-and S_2; of the squares in a group their median is taken, which dust and edges do not move.
+with the images I, their smooth level S, DN, the step q between values, and the Laplacian L, whose squared weights add
+up to 1. A pattern p of the scene's own is in both pictures: D has left of it what the black level makes of it, and t
+what the lights do. All but q come of least squares over groups of pixels of about the same S_1 and S_2; of the squares
+in a group their median is taken, which dust and edges do not move.
 Validity
     linear pictures that no lossy format and no smoothing has passed. Dark noise of r DN is not told from b: the level
     that is found is b - r^2/K. A curve that is bent downwards, as of a camera that codes for viewing, ends below 0 and
@@ -63,9 +63,10 @@ def photon_noise(scenes: Sequence[Sequence[np.ndarray]], saturation: float, step
     told = np.array([f for f in found if f is not None])
     if len(told) < 2:
         return None
-    weight = told[:, 1] ** -2 / (told[:, 1] ** -2).sum()
+    precision = told[:, 1] ** -2.0
+    weight = precision / precision.sum()
     level, _, gain = weight @ told
-    sd = math.hypot(math.sqrt(weight @ (told[:, 0] - level) ** 2), (told[:, 1] ** -2).sum() ** -0.5)
+    sd = math.hypot(math.sqrt(weight @ (told[:, 0] - level) ** 2), precision.sum() ** -0.5)
     return PhotonNoise(float(level), sd, float(gain)) if level > CERTAIN * sd else None
 
 

@@ -49,7 +49,7 @@ from optics.captures.corrections import (
 )
 from optics.captures.importing import MAPS, Imported, comment, filled, noise_of_levels, write_set
 from optics.captures.noise import Noise
-from optics.captures.photon_noise import PhotonNoise, photon_noise
+from optics.captures.photon_noise import OF_GAUSSIAN, PhotonNoise, photon_noise
 from optics.captures.skin_motion import SkinMotion, skin_motion
 from optics.errors import BadCapture, UnknownKey
 from optics.files import yaml_checks
@@ -376,8 +376,8 @@ def neighbour_noise(ratios: np.ndarray, flats: np.ndarray, use: np.ndarray, satu
     order = np.argsort(level[both], kind="stable")
     groups = [(level[both][g], square[both][g]) for g in np.array_split(order, LEVELS)]
     light = np.array([g.mean() for g, _ in groups])
-    # of a squared Gaussian the mean is 2.2 times the median: a speck of dust does not move it
-    variance = np.array([np.median(s) / 0.4549 for _, s in groups])
+    # by the median, which a speck of dust does not move
+    variance = np.array([np.median(s) / OF_GAUSSIAN for _, s in groups])
     # in the dark neighbours round alike: the steps of a camera of 8 bit do not average in blocks
     steps = STEP**2 / 12
     weight = np.array([float(len(g)) for g, _ in groups])

@@ -48,8 +48,9 @@ def fill(path, gel):
 
 
 def along_the_normal(si, coats):
-    """Radiance per irradiance along the normal. Membranes are asked one by one: Dr.Jit cannot follow the derivative by
-    a roughness through a second call of what a surface points to."""
+    """Radiance per irradiance along the normal; of other materials than the membranes, beside them, none. Membranes are
+    asked one by one: Dr.Jit cannot follow the derivative by a roughness through a second call of what a surface points
+    to."""
     import drjit as dr
     import mitsuba as mi
 

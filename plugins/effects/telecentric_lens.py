@@ -15,6 +15,8 @@ References
     Born & Wolf, Principles of Optics, 4.8.3 (entrance pupil at infinity).
 """
 
+from types import SimpleNamespace
+
 import numpy as np
 
 from optics.scene.checking import agree, made
@@ -23,7 +25,7 @@ from optics.scene.declare import Effect
 
 def check_rays():
     """Over a gel whose face is 20 mm away, all rays meet it where they did, and with t = 1 they are parallel; with t =
-    0.5 they come together at 40 mm."""
+    0.5 they come together at 40 mm. The face is sharp all over where the lens is focused on its distance."""
     import mitsuba as mi
 
     film = {"type": "hdrfilm", "width": 80, "height": 60}
@@ -37,6 +39,9 @@ def check_rays():
         agree(met, [20 * x, [20 * x[0] * 0.75, 0, 0], [20.0] * 3], 0, 1e-4)
         # slopes of the rays, as from where they would come together
         agree(d[0] / d[2], (1 - t) * x, 0, 1e-6)
+        own = SimpleNamespace(x_fov=60.0, aspect=1.0, principal_x=0.0, principal_y=0.0, focus=20.0, telecentricity=t)
+        slant = np.linalg.norm(met - o, axis=0)
+        agree(camera.astray(own, np.array([0.0, 20, 80]), np.array([0.0, 30, 30]), slant), 0.0, 0, 1e-5)
 
 
 effect = Effect(

@@ -16,9 +16,9 @@ view. Frame: x right, y down, z forward (OpenCV); the transform `to_world` gives
 departs from it. Rays of plain Mitsuba start on the entrance pupil, a disc of the area `pupil_area` across the axis, and
 meet where the ray through its middle is `focus` from the camera along the axis; so do those of images LED by LED in
 scenes full of beads, and other images are blurred as the effect "defocus" says.
-Over a gel, `telecentricity` t turns rays towards the axis where they leave the untouched face, z = 0, which keeps its
-scale: a ray that the pinhole at the distance Z sends along (x, y, 1) starts at (x, y, 0) t Z and runs along ((1 - t) x,
-(1 - t) y, 1), as if the camera stood at Z/(1 - t).
+Over a gel, `telecentricity` t makes rays more nearly parallel to the axis. Each still meets the untouched face, z = 0,
+where it did: what the pinhole at the distance Z sends along (x, y, 1) starts at (x, y, 0) t Z and runs along
+((1 - t) x, (1 - t) y, 1), as if the camera stood at Z/(1 - t).
 Fingerprint
     principal point and pose shift the image; distortion grows with the third power of the radius; exposure scales all.
 Validity
