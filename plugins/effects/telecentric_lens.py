@@ -1,9 +1,10 @@
 """Telecentric lens: the lens looks along its axis all over the field, or the camera stands farther off than assumed.
 
 Definition
-    a ray that meets the untouched face at (X, Y, 0) comes from the direction of the axis turned by (1 - t) (X, Y)/Z
-with the camera's distance Z in the scene: `telecentricity` t = 1 - Z/Z_t of a camera at Z_t whose image of the face is
-as large; 1 is a telecentric lens, t < 0 a camera that stands nearer, t > 1 a hypercentric lens.
+    d = ((1 - t) X/Z, (1 - t) Y/Z, 1)                            along the ray that meets the face at (X, Y, 0)
+with the camera's distance Z from the untouched face, z = 0, in the scene: `telecentricity` t = 1 - Z/Z_t of a camera at
+Z_t whose image of the face is as large. 1 is a telecentric lens, t < 0 a camera that stands nearer, t > 1 a
+hypercentric lens.
 Fingerprint
     what stands towards the camera by h moves by t h r/Z towards the middle of the image, flanks and all: in each
     contact the side that faces away from the middle is seen at a steeper place. The face itself stays. A scale that is
