@@ -73,6 +73,8 @@ BOUNCE_NUMBERS = 10  # of a direction: a place in the cell, a technique, two dir
 # image by a finite layer, 6 % by the distortion, 1 % or less by the camera, the size of beads and how far they sank
 ROUGHLY = 4
 ROUGH_SAMPLES = 64  # of a pixel, below which no fewer are taken
+# times fewer directions suffice where no frame uses a pixel: what a lens scatters from there is a mean over many cells
+ASIDE = 16
 BOUNCE_CELL = 2  # px each way of a cell; 1 in a crowded scene, whose pixels differ, and of small images
 # directions of a pixel: where BOUNCE_RAYS give as many, each pixel is a cell. What a dent 8 px across reflects into
 # itself is smeared by cells of 2 px, and was found a quarter too strong
@@ -1176,7 +1178,7 @@ class Renderer:
         Light from all around varies slowly: of large images it is gathered for every second pixel each way, over the
         area of the four, and interpolated linearly in between. A cell's directions are those of one Sobol sequence,
         shifted from cell to cell by another, so that what a mean misses is noise of single cells. They are the same for
-        every geometry and LED of a seed, for differences.
+        every geometry and LED of a seed, for differences. Far from the pixels that are wanted they are few.
 
         roughly   with ROUGHLY times fewer directions
         """
@@ -1186,7 +1188,7 @@ class Renderer:
             return np.zeros((1, 1, self.bands))
         cell, samples = self.bounce
         samples = max(samples // ROUGHLY, 1) if roughly else samples
-        key = ("bounced", seed, samples, *self._led_key(values, led))
+        key = ("bounced", seed, samples, *self._image_key(values, led))
         if key in self._plain:
             return self._bounced(values, led, self._plain[key], component)
         if self.hits(values).bare and len(self._world().shapes()) == 1:  # a level skin does not meet itself
@@ -1194,7 +1196,7 @@ class Renderer:
         self.apply(values)
         sample, numbers, met = self._spread(values, seed, samples)
         for other in (led, *sorted(self.together - {led})):  # as for direct light: these will be asked for next
-            own = ("bounced", seed, samples, *self._led_key(values, other))
+            own = ("bounced", seed, samples, *self._image_key(values, other))
             if other in self.scene.sources or own in self._plain:
                 continue
 
@@ -1205,8 +1207,7 @@ class Renderer:
                 world, given = self._world(), Directions(numbers)
                 return self.scene.integrator.bounced(world, *sample[:3], lamp, 1, given, self.grazing, met)
 
-            rows, columns = -(-self.height // cell), -(-self.width // cell)
-            coarse = self._each_band(shade, other).reshape(rows, columns, samples, self.bands).mean(2)
+            coarse = self._over_cells(self._each_band(shade, other), samples)
             image = zoom(coarse, (cell, cell, 1), order=1, mode="nearest", grid_mode=True)
             self._keep_plain(own, image[: self.height, : self.width].astype(np.float32))
         return self._bounced(values, led, self._plain[key], component)
@@ -1214,7 +1215,7 @@ class Renderer:
     def _spread(self, values: Mapping, seed: int, samples: int) -> tuple:
         """`_spread_rays`, and what their second directions meet, which all LEDs share; the latest is kept. None of so
         many rays that they would take more than a quarter of the memory: each LED then traces its own."""
-        key = (seed, samples, self.grazing, self.geometry(values), self._shading(values))
+        key = (seed, samples, self.wanted, self.grazing, self.geometry(values), self._shading(values))
         if self._second is None or self._second[0] != key:
             self._second = None
             sample, numbers = self._spread_rays(seed, samples)
@@ -1239,20 +1240,53 @@ class Renderer:
         import mitsuba as mi
         from scipy.stats import qmc
 
-        key = (seed, samples, *self.bounce)
+        key = (seed, samples, self.wanted, *self.bounce)
         if key not in self._drawn:
             while len(self._drawn) > 1:
                 self._drawn.popitem(last=False)
-            rows, columns = (-(-size // self.bounce[0]) for size in (self.height, self.width))
+            rows, columns = self._cells()
             rng = np.random.default_rng([seed, 77])
             drawn, shifts = (
                 qmc.Sobol(BOUNCE_NUMBERS, rng=rng).random(_power_of_two(n))[:n] for n in (samples, rows * columns)
             )
-            numbers = ((drawn + shifts[:, None]) % 1).reshape(-1, BOUNCE_NUMBERS)
-            v, u = (np.repeat(a.ravel(), samples) for a in np.mgrid[:rows, :columns])
+            parts = [
+                (np.divmod(np.repeat(cells, count), columns), (drawn[:count] + shifts[cells, None]) % 1)
+                for cells, count in self._counted(samples)
+            ]
+            numbers = np.concatenate([own.reshape(-1, BOUNCE_NUMBERS) for _, own in parts])
+            v, u = (np.concatenate([place[k] for place, _ in parts]) for k in (0, 1))
             at = [a + numbers[:, k] for k, a in enumerate((u, v))]
             self._drawn[key] = at, [mi.Float(c) for c in np.ascontiguousarray(numbers[:, 2:].T, np.float32)]
         return self._drawn[key]
+
+    def _cells(self) -> tuple[int, int]:
+        """Rows and columns of the cells that second reflections are gathered for."""
+        return -(-self.height // self.bounce[0]), -(-self.width // self.bounce[0])
+
+    def _counted(self, samples: int) -> list[tuple[np.ndarray, int]]:
+        """(numbers of cells, directions of each): of those that wanted pixels lie in or beside, as many as asked for;
+        of all others few."""
+        from scipy.ndimage import binary_dilation
+
+        rows, columns = self._cells()
+        if self.wanted is None:
+            return [(np.arange(rows * columns), samples)]
+        cell = self.bounce[0]
+        mask = np.pad(self.wanted.mask, ((0, rows * cell - self.height), (0, columns * cell - self.width)))
+        near = mask.reshape(rows, cell, columns, cell).any((1, 3))
+        if cell > 1:  # images are interpolated between cells
+            near = binary_dilation(near, np.ones((3, 3), bool))
+        fewer = max(samples // ASIDE, 1)
+        return [(np.flatnonzero(near), samples), (np.flatnonzero(~near), fewer)]
+
+    def _over_cells(self, light: np.ndarray, samples: int) -> np.ndarray:
+        """(rows, columns, B) means of what directions brought, cell by cell."""
+        found, begin = np.empty((*self._cells(), self.bands), light.dtype), 0
+        for cells, count in self._counted(samples):
+            end = begin + len(cells) * count
+            found.reshape(-1, self.bands)[cells] = light[begin:end].reshape(-1, count, self.bands).mean(1)
+            begin = end
+        return found
 
     def _bounced(self, values: Mapping, led: str, image: np.ndarray, component: int) -> np.ndarray:
         """A bounced image behind the layers."""
