@@ -116,8 +116,10 @@ def levels(
         for v in case.variables_of(c.effect)
         if v.frames is not None and set(v.frames) & set(held_out)
     ]
-    free = [*pose, *own]
-    predictions, values = _predicted(case, with_them.values.copy(), free)
+    free, start = [*pose, *own], with_them.values.copy()
+    for v in () if evidence.is_table else pose:  # a press lies where it lay without the effects, or nearly so
+        start.put(v, value_of(case.model, base_values, v))
+    predictions, values = _predicted(case, start, free)
     if own:
         base = _crossed(case, pose, held_out, predictions_of_base, base_values, masks, sds)
         with_effect = _crossed(case, free, held_out, predictions, values, masks, sds)
