@@ -9,8 +9,8 @@ Fingerprint
     the middle there are none. Radial distortion moves all colours alike; dispersion of a body acts at the body's edges.
 Validity
     a line over the wavelength: an achromat, whose two ends of the visible meet, needs a parabola. The image is
-    resampled by cubic splines through halves of pixels, which move details below 2 px by 5 % less than they should; in
-    a single band without a wavelength nothing happens.
+    resampled by cubic splines through halves of pixels, which move details below 2 px by 5 % less than they should. In
+    a single band nothing happens: the size of its image is that of the field of view.
 References
     Born & Wolf, Principles of Optics, 4.7 (chromatic aberration of magnification); Unser, IEEE Signal Processing
     Magazine 16 (6), 22 (1999).
@@ -27,7 +27,8 @@ from optics.scene.parameter import Parameter
 
 
 def resize(image, camera):
-    growth = camera.lateral_colour * np.where(camera.bands > 0, (camera.bands - 540.0) / 100, 0.0)
+    several = np.ptp(camera.bands) > 0
+    growth = camera.lateral_colour * np.where(several & (camera.bands > 0), (camera.bands - 540.0) / 100, 0.0)
     middle = tuple(
         camera.side * (n / 2 + np.real(m))
         for n, m in ((camera.width, camera.principal_x), (camera.height, camera.principal_y))
@@ -50,6 +51,8 @@ def check_parabola():
         x, y = u / (1 + g), v / (1 + g)
         expected = (2.0 + 0.1 * x - 0.03 * x * y + 0.05 * y**2)[20:-20, 20:-20]
         agree(found[..., band], expected, 1e-9, 1e-9)
+    camera.bands = camera.bands[:1]
+    agree(resize(parabola[..., None], camera), parabola[..., None], 1e-9, 1e-9)
 
 
 effect = Effect(
