@@ -8,7 +8,7 @@ import pytest
 from optics.files.output import shipped
 from optics.light.rendering import RenderJob
 from optics.proof.makers import colour as makers
-from optics.proof.rigs.colour import WildColour
+from optics.proof.rigs.colour import DigitColour, WildColour
 from optics.scene import loader
 
 DIGIT = {"width": "24", "height": "32", "depth": "0.6", "bands": "auto"}
@@ -52,10 +52,11 @@ def greys_of(scene, seen):
 
 
 @pytest.mark.slow
-def test_what_powers_and_rho_leave_of_a_metameric_paint(digit):
+def test_what_powers_and_rho_leave_of_a_metameric_paint(mitsuba):
     """With one light in each range it is all but a gain of that light; the flanks of lines 17 to 47 nm wide, which
     reach into other ranges and channels, leave 8.4 % of its image. That share by sums in steps of 1 nm, of lines as
     formulas: the nodes follow it to 2 %, as there are two for a line (of a single one all but .3 % was taken up)."""
+    digit = loader.load("digit", {**DigitColour.defines, **DIGIT})  # Gaussians, as the maker's
     camera = makers.sensitivities("Nikon 5100 (NPL)")
     seen = {led: camera * makers.spectrum(lamp, {}) for led, lamp in WildColour.lamps.items()}
     nm, ranges, grey = makers.NM, [], greys_of(digit, seen)
