@@ -23,7 +23,7 @@ def coordinates(model: SceneModel, values: Values, index: int, seed: int = 0) ->
     """name -> (H, W), units in `optics.fit.compare.UNITS`; boolean for a region, NaN where a pixel has no value.
 
     Of a sweep of readings, (N, 1): only intensity, the set values and the row in the table tell readings apart."""
-    now = model.at(values, index)
+    now = model.turn_to(values, index)
     intensity = model.intensity(now, index, seed)
     if model.captures.table is not None:
         frame = model.frames[index]
@@ -112,7 +112,7 @@ def lit_geometry(model: SceneModel, values: Values, frame: int) -> dict[str, np.
     """
     if model.captures.table is not None:
         return {}
-    now, scene, renderer = model.at(values, frame), model.scene, model.renderer
+    now, scene, renderer = model.turn_to(values, frame), model.scene, model.renderer
     hits = renderer.hits(now)
     p, n = hits.position, hits.normal
     eye = _to_camera(hits)

@@ -349,7 +349,7 @@ class SceneModel:
         are done; several at once where processes are allowed and would not share the frames."""
         return self.hands.each(self, frames, [partial(_made_by, sparing=self.sparing, job=job) for job in jobs])
 
-    def _turn_to(self, values: Values, index: int) -> dict:
+    def turn_to(self, values: Values, index: int) -> dict:
         """A frame's values; tells the renderer which other LEDs will be asked for in the same geometry, and of which
         pixels."""
         self.renderer.together = self.companions[index]
@@ -358,8 +358,9 @@ class SceneModel:
 
     @contextmanager
     def where_used(self) -> Iterator[None]:
-        """Within it, predictions take finer samples only at the pixels that a frame of the same press uses, and beside
-        them: of a mask that leaves a part of the image, a fit need not know the rest well."""
+        """Within it, predictions take finer samples, and all directions of second reflections, only at pixels that a
+        frame of the same press uses, and beside them: of a mask that leaves a part of the image, a fit need not know
+        the rest well."""
         before, self.sparing = self.sparing, True
         try:
             yield
@@ -447,7 +448,7 @@ class SceneModel:
     def _differentiate(
         self, values: Values, variables: Sequence[Variable], secant: Mapping[str, float], seed: int, index: int
     ):
-        now = self._turn_to(values, index)
+        now = self.turn_to(values, index)
         black = self.noise.black_level
         linear = self._linear(now, index, seed)
         prediction = linear.image
@@ -492,7 +493,7 @@ class SceneModel:
             self._hold(images, variable.name, key, image, index)
         for variable, acts, key, image in waiting:
             own = {k: f for k, f in acts.items() if not self._rests(k)}
-            with self.renderer.splitting(self._side(at_rest)):
+            with everywhere(self.renderer), self.renderer.splitting(self._side(at_rest)):
                 still = self._tangent(rest, at_rest, own, seed, True)
             if image is not None or still is not None:
                 image = scale * ((0 if image is None else image) - share * (0 if still is None else still))
@@ -826,7 +827,7 @@ class SceneModel:
 
     def _bent(self, values: Values, index: int) -> np.ndarray:
         """The second order of `_of_settings`, by finite differences of one standard deviation."""
-        now, frame = self._turn_to(values, index), self.frames[index]
+        now, frame = self.turn_to(values, index), self.frames[index]
         total = np.zeros((1, 1, 1))
         for key, weighed in self._dialled(index).items():
             if key in self.driven:
@@ -841,7 +842,7 @@ class SceneModel:
     def slopes(self, values: Values, index: int, factors: Mapping[str, float]) -> dict[str, np.ndarray]:
         """key -> factor d prediction / d setting in a frame, (N, 1, C) DN per unit; without those that change
         nothing."""
-        now = self._turn_to(values, index)
+        now = self.turn_to(values, index)
         linear = self._linear(now, index, 0)
         found = {key: self._tangent(linear, now, {key: factor}, 0) for key, factor in factors.items()}
         return {key: slope for key, slope in found.items() if slope is not None}
@@ -892,7 +893,7 @@ def _made_by(model: SceneModel, sparing: bool, job: Job) -> Any:
 
 def _predicted(model: SceneModel, index: int, sparing: bool, values: Values, seed: int) -> np.ndarray:
     model.sparing = sparing
-    return model._predict(model._turn_to(values, index), index, seed)
+    return model._predict(model.turn_to(values, index), index, seed)
 
 
 def _differentiated(

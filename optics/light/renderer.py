@@ -73,8 +73,10 @@ BOUNCE_NUMBERS = 10  # of a direction: a place in the cell, a technique, two dir
 # image by a finite layer, 6 % by the distortion, 1 % or less by the camera, the size of beads and how far they sank
 ROUGHLY = 4
 ROUGH_SAMPLES = 64  # of a pixel, below which no fewer are taken
-# times fewer directions suffice where no frame uses a pixel: what a lens scatters from there is a mean over many cells
+# Where no frame uses a pixel, times fewer directions, but so many at least: glare brings the mean of many such cells.
+# Of a lens that blurs far, pixels within its reach of a mask get the noise of a few
 ASIDE = 16
+FEWEST = 4
 BOUNCE_CELL = 2  # px each way of a cell; 1 in a crowded scene, whose pixels differ, and of small images
 # directions of a pixel: where BOUNCE_RAYS give as many, each pixel is a cell. What a dent 8 px across reflects into
 # itself is smeared by cells of 2 px, and was found a quarter too strong
@@ -90,7 +92,7 @@ class Pixels:
 
 @contextmanager
 def everywhere(renderer) -> Iterator[None]:
-    """Within it all pixels take finer samples: for the gel at rest, which frames with other masks share."""
+    """Within it all pixels are wanted: for the gel at rest, which frames with other masks share."""
     wanted, renderer.wanted = renderer.wanted, None
     try:
         yield
@@ -191,7 +193,8 @@ class Renderer:
         self.together: set[str] = set()  # LEDs whose images are wanted of the same geometry
         self.asked: set[str] = set()  # parameters whose derivatives will be asked for, see `asking`
         self._slopes: dict[tuple, tuple[LedImage, dict[str, tuple]]] = {}  # those that were made with others
-        self.wanted: Pixels | None = None  # those that take finer samples where they need them; None: all
+        # those that take finer samples where they need them, and all directions of second reflections; None: all
+        self.wanted: Pixels | None = None
         # whether something of the scene must be asked of each LED by itself: of plugins of one's own nobody knows
         self.apart = bool(scene.registry.own_files)
         self.side = 1  # values of a pixel each way, see `splitting`
@@ -1264,8 +1267,8 @@ class Renderer:
         return -(-self.height // self.bounce[0]), -(-self.width // self.bounce[0])
 
     def _counted(self, samples: int) -> list[tuple[np.ndarray, int]]:
-        """(numbers of cells, directions of each): of those that wanted pixels lie in or beside, as many as asked for;
-        of all others few."""
+        """(numbers of cells, directions of each): of those that wanted pixels are interpolated from, as many as asked
+        for; of all others few."""
         from scipy.ndimage import binary_dilation
 
         rows, columns = self._cells()
@@ -1274,9 +1277,9 @@ class Renderer:
         cell = self.bounce[0]
         mask = np.pad(self.wanted.mask, ((0, rows * cell - self.height), (0, columns * cell - self.width)))
         near = mask.reshape(rows, cell, columns, cell).any((1, 3))
-        if cell > 1:  # images are interpolated between cells
+        if cell > 1:
             near = binary_dilation(near, np.ones((3, 3), bool))
-        fewer = max(samples // ASIDE, 1)
+        fewer = min(max(samples // ASIDE, FEWEST), samples)
         return [(np.flatnonzero(near), samples), (np.flatnonzero(~near), fewer)]
 
     def _over_cells(self, light: np.ndarray, samples: int) -> np.ndarray:

@@ -12,7 +12,7 @@ Validity
     one blur over the field, alike in front of the focus and behind it. On sharp edges the onset is linear up to 1/16
     px^2 only; the ranking therefore tries a finite step as well. Halves of pixels are blurred: at rims that are
     narrower a strength was off by up to 0.2 % (three sets of 24 x 32 px), and by 1.4 % with whole pixels. In a single
-    band nothing happens: that one colour is out of focus is lens blur.
+    band nothing happens: that one colour is out of focus is lens blur, and so nearly is that of one narrow light.
 References
     Born & Wolf, Principles of Optics, 4.7 (axial chromatic aberration) and 8.8 (defocus).
 """

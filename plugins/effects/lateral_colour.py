@@ -10,7 +10,8 @@ Fingerprint
 Validity
     a line over the wavelength: an achromat, whose two ends of the visible meet, needs a parabola. The image is
     resampled by cubic splines through halves of pixels, which move details below 2 px by 5 % less than they should. In
-    a single band nothing happens: the size of its image is that of the field of view.
+    a single band nothing happens, and of one narrow light in several bands next to nothing but a change of the size,
+    which is the field of view.
 References
     Born & Wolf, Principles of Optics, 4.7 (chromatic aberration of magnification); Unser, IEEE Signal Processing
     Magazine 16 (6), 22 (1999).

@@ -3,17 +3,17 @@
 Definition
     L' = L (1 + q(x, y) c(x, y)),   c = 1 where the object touches the face, 0 elsewhere
     q = q_x x + q_y y + (q_xx x^2 + 2 q_xy x y + q_yy y^2)/2
-with the place (x, y) on the face from the gel's middle: what its gain g differs by from that of a `thin coating` in the
-middle. Of a coat that scatters and absorbs nothing, of the thickness d(x, y), with R = S d/(1 + S d) and an object of
-the reflectance rho_b behind it,
+with the place (x, y) on the face from the gel's middle. Where the gain of a `thin coating` is g, and g_0 in the middle,
+q = (g - g_0)/(1 + g_0). Of a coat that scatters and absorbs nothing, of the thickness d(x, y), with R = S d/(1 + S d)
+and an object of the reflectance rho_b behind it,
     g = rho_b (1 - R)^2 / (R (1 - R rho_b)),    dg/g = -(1 + R - rho_b R (1 - R)/(1 - R rho_b)) dd/d
-so that a coat thinner by 10 % lets through 10 to 20 % more.
+so that g is larger by 10 to 20 % where the coat is thinner by 10 %.
 Fingerprint
-    contacts differ in brightness by where they are on the face, the same under every LED and with every object, and
-    smoothly. A curved face makes such gradients that turn with the LED. Where nothing touches there is none: what the
-    coat itself reflects is in the flat field.
+    contacts differ in brightness by where they are on the face, the same under every LED and with every shape of one
+    material, and smoothly. A curved face makes such gradients that turn with the LED. Where nothing touches there is
+    none: what the coat itself reflects is in the flat field.
 Validity
-    a thickness that varies slowly over the face; objects that are alike. Objects that differ, or grains of the coat,
+    a thickness that varies slowly over the face; objects of one reflectance. Bodies that differ, or grains of the coat,
     make contacts differ from one to the next: those have no such law.
 References
     Kubelka, J. Opt. Soc. Am. 38, 448 (1948), layers over a backing; the neglect of S1.4: a coat that is the same
@@ -65,7 +65,7 @@ effect = Effect(
         coefficient("uneven_xy", "1/mm^2", 1.0, 0.005, "x y"),
         coefficient("uneven_yy", "1/mm^2", 1.0, 0.005, "y^2/2"),
     ),
-    acts=("row", "column"),
+    acts=("row", "column", "contact_distance"),
     needs="contacts all over the field, whose edges are in view",
     checks=(check_two_contacts,),
 )

@@ -11,21 +11,26 @@ from optics.scene.parameter import Variable
 BLUR = 0.4  # px
 
 
-@pytest.mark.parametrize("blur", (0.0, BLUR))
-def test_values_that_are_used_stay(bench, blur):
+@pytest.mark.parametrize(("blur", "second"), ((0.0, 0.0), (BLUR, 0.0), (0.0, 0.5)))
+def test_values_that_are_used_stay(bench, blur, second):
+    """With light that is reflected twice, too, of which the rest of the image gathers little."""
     model = bench.model
     mask = np.zeros(model.shape[:2], bool)
     mask[20:40, 10:30] = True  # across the rim of the dent, where shadows and bends are
     frame = model.frames[0]
     keys = ("led_1.x", "gel.press_x", "membrane.sigma")
     variables = [Variable(key, (key,), bench.scene.parameters[key]) for key in keys]
-    values = bench.at({bench.scene.key("camera", "blur") or "camera.blur": blur**2})
-    model.frames[0] = replace(frame, mask=mask)
+    twice = model.renderer.bounce_key
+    variables += [Variable(twice, (twice,), bench.scene.parameters[twice])]
+    values = bench.at({bench.scene.key("camera", "blur") or "camera.blur": blur**2, twice: second})
+    image = np.clip(model.predict(values)[0], 1, 0.9 * model.noise.saturation)  # nothing is clipped
+    model.frames[0] = replace(frame, mask=mask, image=image)
     try:
         whole, slopes = next(iter(model.derivatives(values, variables)))
         with model.where_used():
             sparing, own = next(iter(model.derivatives(values, variables)))
-            assert not model._needed(0).mask.all()
+            needed = model._needed(0).mask
+            assert needed[mask].all() and not needed.all()
         again = model.predict(values)[0]
         far = ~model._needed(0).mask
     finally:
@@ -34,7 +39,7 @@ def test_values_that_are_used_stay(bench, blur):
     scale = np.abs(whole).max()
     # without a lens single precision is left; with one, a hundredth of the camera's dark noise of 1 DN
     assert np.abs(sparing - whole)[mask].max() < (0.01 if blur else 1e-6 * scale)
-    for key in keys:
+    for key in (*keys, twice):
         left = np.abs(own[key] - slopes[key])[mask].max() / np.abs(slopes[key]).max()
         # a blur far below a pixel rings: of the slope three pixels beside it brings 2 V/9 of V = .16 px^2, a few per
         # cent, of which finer samples change a part

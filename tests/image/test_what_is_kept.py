@@ -98,6 +98,10 @@ def test_second_reflections_are_gathered_where_they_are_wanted(scene, values, ce
     aside, known = some[~mask].mean(0), everywhere[~mask].mean(0)
     # noise of 64 directions a cell, few of which meet a lit flank: 4 % of the mean, over 12 sets of directions
     assert np.all(known > 0) and np.allclose(aside, known, rtol=0.15)
+    left, right = (
+        (image * ~mask[..., None])[:, :, 0].reshape(6, 4, 8, 4).sum((1, 3)).ravel() for image in (some, everywhere)
+    )
+    assert np.corrcoef(left, right)[0, 1] > 0.95  # each where it belongs: in blocks of 4 px
     # what is kept for some pixels does not serve others
     part.wanted = None
     assert np.allclose(part.bounced(values, "led_1"), everywhere, rtol=1e-5, atol=1e-7 * everywhere.max())
