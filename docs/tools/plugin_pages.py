@@ -195,7 +195,7 @@ def figure_of(effect, record: dict) -> str:
     own = record[effect.key]
     values = ", ".join(f"`{k} = {number(v)}`" for k, v in list(own["strength"].items())[:3])
     more = f" and {len(own['strength']) - 3} more alike" if len(own["strength"]) > 3 else ""
-    times = "the plausible strength" if own["factor"] == 1 else f"{own['factor']} times the plausible strength"
+    times = "the plausible strength" if own["factor"] == 1 else f"{own['factor']:g} times the plausible strength"
     if own["along"] is None:
         seen = (
             f"Without, with, and the difference (gray: none; near white and black: ±{own['scale']:g} DN), at {times}: "
