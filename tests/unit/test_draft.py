@@ -279,7 +279,7 @@ def lit_point(powers):
     }
     return SimpleNamespace(
         renderer=SimpleNamespace(hits=lambda now: hits, image=lambda now, led: np.ones((1, 1, 3))),
-        at=lambda values, frame: now,
+        turn_to=lambda values, frame: now,
         captures=SimpleNamespace(table=None),
         lit=lambda now: powers,
         scene=SimpleNamespace(
