@@ -6,7 +6,8 @@ Definition
 with the place (x, y) on the face from the gel's middle. Where the gain of a `thin coating` is g, and g_0 in the middle,
 q = (g - g_0)/(1 + g_0). Of a coat that scatters and absorbs nothing, of the thickness d(x, y), with R = S d/(1 + S d)
 and an object of the reflectance rho_b behind it,
-    g = rho_b (1 - R)^2 / (R (1 - R rho_b)),    dg/g = -(1 + R - rho_b R (1 - R)/(1 - R rho_b)) dd/d
+    g = rho_b (1 - R)^2 / (R (1 - R rho_b))
+    dg/g = -(1 + R - rho_b R (1 - R)/(1 - R rho_b)) dd/d
 so that g is larger by 10 to 20 % where the coat is thinner by 10 %.
 Fingerprint
     contacts differ in brightness by where they are on the face, the same under every LED and with every shape of one
