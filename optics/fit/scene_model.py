@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 CUT_OFF = 3  # readings of 0, and none below, that tell of an instrument that shows no negative numbers
 DERIVATIVES = 2e8  # bytes of derivative images that are kept: the refits of a diagnosis begin with those of its scores
 KEPT = 4  # points in parameter space, for each frame, at which the variance that settings bring is remembered
+MOST = 0.8  # of the pixels, above which all are needed: what differs from press to press costs more than it saves
 BESIDE = 2  # px: with a blur of 0.4 px, what is left out beyond changes used values by 1e-5 of the image
 FLAT_FIELDS = ("multiplicative", "additive", "none")
 
@@ -368,8 +369,8 @@ class SceneModel:
             self.sparing, self.renderer.wanted = before, None
 
     def _needed(self, index: int) -> Pixels | None:
-        """Pixels that frames of the same press use, and those within BESIDE of them; None: all. One object for all
-        frames of a press, as they share its images.
+        """Pixels that frames of the same press use, and those within BESIDE of them; None: MOST or all. One object for
+        all frames of a press, as they share its images.
 
         A lens that shifts by more than BESIDE brings the value of a pixel's middle to the edge of a mask."""
         if index not in self._needed_kept:
@@ -379,7 +380,7 @@ class SceneModel:
                 self.renderer.wanted = None  # masks may look at images themselves
                 used = np.any([self.usable(i).any(-1) for i in press], axis=0)
                 near = ndimage.binary_dilation(used, np.ones((2 * BESIDE + 1, 2 * BESIDE + 1), bool))
-                needed = None if near.all() else Pixels(near)
+                needed = None if near.mean() > MOST else Pixels(near)
             self._needed_kept.update(dict.fromkeys(press, needed))
         return self._needed_kept[index]
 

@@ -77,9 +77,6 @@ ROUGH_SAMPLES = 64  # of a pixel, below which no fewer are taken
 # Of a lens that blurs far, pixels within its reach of a mask get the noise of a few
 ASIDE = 16
 FEWEST = 4
-MOST_WANTED = (
-    0.8  # of the pixels, above which all are gathered: sets of directions that differ from press to press cost
-)
 BOUNCE_CELL = 2  # px each way of a cell; 1 in a crowded scene, whose pixels differ, and of small images
 # directions of a pixel: where BOUNCE_RAYS give as many, each pixel is a cell. What a dent 8 px across reflects into
 # itself is smeared by cells of 2 px, and was found a quarter too strong
@@ -1246,7 +1243,7 @@ class Renderer:
         import mitsuba as mi
         from scipy.stats import qmc
 
-        key = (seed, samples, self._gathered(), *self.bounce)
+        key = (seed, samples, self.wanted, *self.bounce)
         if key not in self._drawn:
             while len(self._drawn) > 1:
                 self._drawn.popitem(last=False)
@@ -1269,21 +1266,16 @@ class Renderer:
         """Rows and columns of the cells that second reflections are gathered for."""
         return -(-self.height // self.bounce[0]), -(-self.width // self.bounce[0])
 
-    def _gathered(self) -> Pixels | None:
-        """The wanted pixels, as far as second reflections ask; None: all, as where few would be left out."""
-        return None if self.wanted is None or self.wanted.mask.mean() > MOST_WANTED else self.wanted
-
     def _counted(self, samples: int) -> list[tuple[np.ndarray, int]]:
         """(numbers of cells, directions of each): of those that wanted pixels are interpolated from, as many as asked
         for; of all others few."""
         from scipy.ndimage import binary_dilation
 
         rows, columns = self._cells()
-        wanted = self._gathered()
-        if wanted is None:
+        if self.wanted is None:
             return [(np.arange(rows * columns), samples)]
         cell = self.bounce[0]
-        mask = np.pad(wanted.mask, ((0, rows * cell - self.height), (0, columns * cell - self.width)))
+        mask = np.pad(self.wanted.mask, ((0, rows * cell - self.height), (0, columns * cell - self.width)))
         near = mask.reshape(rows, cell, columns, cell).any((1, 3))
         if cell > 1:
             near = binary_dilation(near, np.ones((3, 3), bool))
