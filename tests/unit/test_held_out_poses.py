@@ -3,7 +3,11 @@
 from contextlib import nullcontext
 from types import SimpleNamespace
 
-from optics.scene.parameter import Values
+import numpy as np
+import pytest
+
+from optics.diagnosis import held_out
+from optics.scene.parameter import Values, Variable
 from optics.study import loop
 
 
@@ -40,3 +44,31 @@ def test_values_without_some_variables_have_what_was_given_again():
     assert left.common == {"led.x": 1.0, "camera.glare": 0.1}
     assert left.frame == {0: {"gel.press_x": 2.0}, 1: {}}
     assert "camera.glare" not in now.without([glare], {}).common and now.common["camera.glare"] == 0.3
+
+
+@pytest.mark.parametrize(("near", "starts", "left"), [(4.0, [2.0], 4.0), (9.0, [2.0, 0.0], 1.0)])
+def test_a_held_out_press_starts_where_the_base_had_it(near, starts, left, monkeypatch):
+    """At 2 mm, where the base misses by 5; where that is no better, at 0 too, where the effect's own fit has it."""
+    press = Variable("press", ("press",), None)
+    asked, misses = [], {0.0: 1.0, 2.0: near}
+
+    def predicted(case, start, free):
+        asked.append(start.common["press"])
+        return [misses[start.common["press"]]], start
+
+    monkeypatch.setattr(held_out, "_predicted", predicted)
+    monkeypatch.setattr(held_out, "_square", lambda model, f, prediction, *_: prediction)
+    monkeypatch.setattr(held_out, "noisier", lambda *_: 0.0)
+    monkeypatch.setattr(held_out, "chi2", lambda *_: (1.0, 1.0))
+    case = SimpleNamespace(
+        evidence=SimpleNamespace(normal=SimpleNamespace(square=1.0, count=1), noise=1.0, is_table=False),
+        model=SimpleNamespace(base={"press": 0.0}),
+        held_out=[0],
+        say=lambda *_: None,
+        variables_of=lambda effect: [],
+    )
+    one = np.ones((1, 1, 1))
+    base = held_out.Base([press], Values({"press": 2.0}), [5.0], [one], [one])
+    member = SimpleNamespace(effect=SimpleNamespace(name="glare"))
+    found = held_out.levels(case, base, [member], SimpleNamespace(values=Values({"press": 0.0})))
+    assert asked == starts and found[-1].chi2_held_out == left and found[-1].fall == 5.0 - left
