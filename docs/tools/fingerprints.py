@@ -211,11 +211,10 @@ def strengths(effect, reg, scene, holders, factor: float) -> dict[str, float]:
     return values
 
 
-def reached(effect, reg, values: dict[str, float], factor: float) -> float:
+def reached(effect, reg, values: dict[str, float]) -> float:
     """How many plausible strengths these values are: less than was asked for where a bound is nearer."""
     own = [reg.parameter(effect.part, key.rsplit(".", 1)[1]) for key in values]
-    most = max(abs(v - p.neutral) / p.plausible for v, p in zip(values.values(), own))
-    return factor if most >= 0.999 * factor else float(f"{most:.3g}")
+    return float(f"{max(abs(v - p.neutral) / p.plausible for v, p in zip(values.values(), own)):.3g}")
 
 
 def draw(effect, reg) -> dict:
@@ -243,7 +242,7 @@ def draw(effect, reg) -> dict:
     return {
         "view": view.words(),
         "along": view.along,
-        "factor": reached(effect, reg, values, factor),
+        "factor": reached(effect, reg, values),
         "strength": {k: float(f"{v:.6g}") for k, v in values.items()},
         "rms": float(f"{np.sqrt((change**2).mean()) / signal:.3g}"),
         "scale": float(f"{scale:.3g}"),
