@@ -525,7 +525,8 @@ def _add_frame(
     if isinstance(evidence.spectrum, st.Sweeps):
         evidence.spectrum.add(good, where, a, _swept(model.frames[frame], prediction))
     else:
-        evidence.spectrum.add(good, where, a)
+        signal = np.where(good, (prediction - model.noise.black_level) * weight, 0.0)
+        evidence.spectrum.add(good, where, a, signal)
     keep = good & st.lattice(image.shape, evidence.thinning, n)
     evidence.blocks.append(
         Block(

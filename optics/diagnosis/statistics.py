@@ -34,6 +34,7 @@ VISIBLE = 1e-6  # survival below which normal equations in double precision cann
 DRAWS = 40_000  # of the simulated maximum: 1 % of them are 400, known to 5 %
 BINS = 16  # of a curve along a coordinate
 RIPPLES, FREQUENCIES = 8, 1000  # frequencies from which, and up to which, the strongest one is looked for
+CYCLES, TRIALS = 2, 2  # from which on a gain of whole lines is looked for; trials a cycle
 NARROW = 8  # cosines per side that count as low frequency
 
 
@@ -508,8 +509,9 @@ def planes_of(use: np.ndarray) -> list[tuple]:
 
 
 class Spectrum:
-    """Power of whitened residuals in the lowest NARROW x NARROW cosines against the highest quarter; and of the
-    strongest frequency along rows and columns against all others. p is the smaller of both, times two.
+    """Power of whitened residuals in the lowest NARROW x NARROW cosines against the highest quarter; that of the
+    strongest frequency along rows and columns against all others; and that of a gain of whole rows or columns. p is
+    the smallest of the three, times three.
 
     White noise has the same power in both, whatever its size: an error of the gain changes nothing, structure does.
     The degrees of freedom that a calibration takes from the low frequencies are counted from the images of J.
@@ -518,10 +520,13 @@ class Spectrum:
     def __init__(self, columns: int):
         self.low_gram = np.zeros((columns, columns))
         self.planes: list[list[tuple]] = []
+        self.signals: list[np.ndarray] = []
         self.trace = self.square = self.high_count = 0.0
 
-    def add(self, use: np.ndarray, where: Index, columns: np.ndarray) -> None:
-        """Add a frame: use (H, W, C) bool; columns (H, W, C, k), whitened and zero outside, in the places `where`."""
+    def add(self, use: np.ndarray, where: Index, columns: np.ndarray, signal: np.ndarray) -> None:
+        """Add a frame: use (H, W, C) bool; columns (H, W, C, k) and the light that is predicted (H, W, C), whitened
+        and zero outside, columns in the places `where`."""
+        self.signals.append(signal.astype(np.float32))
         planes = [p for p in planes_of(use) if min(use[p].shape) >= 16 and use[p].mean() > 0.2]
         self.planes.append(planes)
         where = np.asarray(where, int)
@@ -564,9 +569,43 @@ class Spectrum:
         mean_high = high / dof_high
         f = low / expected / max(mean_high, 1e-300)
         p = float(fdtrc(dof_low, dof_high, f))
-        if (ripple := self._ripple(residuals)) < p:
-            p = ripple
-        return Structure(f, min(1.0, 2 * p), dof_low, dof_high, mean_high)
+        p = min(p, self._ripple(residuals), self._bands(residuals))
+        return Structure(f, min(1.0, 3 * p), dof_low, dof_high, mean_high)
+
+    def _bands(self, residuals: Sequence[np.ndarray]) -> float:
+        """p of the strongest frequency, of CYCLES or more, of a gain of whole rows or columns, the same in all
+        channels: of each frame (mains light under a rolling shutter) and of all frames together (a read-out).
+
+        The gain of a line in units of its own error is z = sum r g / sqrt(sum r^2 g^2), g the light predicted: no
+        image alone shows what a hundred show together. P(f) = 2 |sum_n z_n exp(-2 pi i f n)|^2 / N of white noise is
+        chi2 with two degrees of freedom, and sums over frames have two for each (Scargle, Astrophysical Journal 263,
+        835 (1982), eq. 10 and 13). In steps of a quarter cycle, trials are TRIALS a cycle. Where lines vary by more
+        than their errors, all frequencies do: P is then measured by its mean elsewhere, further than three quarters of a cycle off,
+        and F is asked instead of chi2."""
+        from scipy.special import fdtrc, gammaincc
+
+        weighed = [r * g for r, g in zip(residuals, self.signals)]
+        ps = []
+        for axis in (0, 1):
+            u = np.array([w.sum((1 - axis, 2), dtype=float) for w in weighed])
+            v = np.array([(w**2).sum((1 - axis, 2), dtype=float) for w in weighed])
+            held = v > 0
+            z = np.where(held, u / np.sqrt(np.where(held, v, 1.0)), 0.0)
+            mean = u.sum(0) / np.sqrt(np.maximum(v.sum(0), 1e-300))
+            own = (z - mean / math.sqrt(len(z))) * held * math.sqrt(len(z) / max(len(z) - 1, 1))
+            for profiles, order in ((mean[None], 1), (own, len(z) - 1)):
+                lines, n = np.count_nonzero(profiles, 1), len(mean)
+                profiles = profiles[lines >= 16]
+                if not len(profiles) or not order:
+                    continue
+                power = np.abs(np.fft.rfft(profiles, 4 * n, axis=1)[:, 4 * CYCLES :]) ** 2
+                power = power.T @ (order / len(profiles) / lines[lines >= 16])
+                k = int(power.argmax())
+                rest = np.delete(power, slice(max(k - 3, 0), k + 4)) / order
+                scale, known = float(rest.mean()), 2 * order * len(rest) / 4
+                p = fdtrc(2 * order, known, power[k] / scale / order) if scale > 1 else gammaincc(order, power[k])
+                ps.append(float(p) * TRIALS * n / 2)
+        return min(1.0, min(ps, default=1.0) * max(len(ps), 1))
 
     def _ripple(self, residuals: Sequence[np.ndarray]) -> float:
         """p of the strongest frequency in the means of rows and of columns, against the mean of all frequencies: bands

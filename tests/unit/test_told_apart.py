@@ -550,7 +550,7 @@ def test_what_leaves_a_lamp_that_wanders_leaves_nothing(swing, pattern, noise, m
     left = [noise * rng.standard_normal(shape) + 50 * g + slope for g in lamp]
     spectrum = st.Spectrum(1)
     for _ in left:
-        spectrum.add(np.ones(shape, bool), [0], np.zeros((*shape, 1)))
+        spectrum.add(np.ones(shape, bool), [0], np.zeros((*shape, 1)), np.full(shape, 50.0))
     evidence = SimpleNamespace(
         frames=range(8),
         sigma=[np.ones(shape)] * 8,
