@@ -580,8 +580,8 @@ class Spectrum:
         image alone shows what a hundred show together. P(f) = 2 |sum_n z_n exp(-2 pi i f n)|^2 / N of white noise is
         chi2 with two degrees of freedom, and sums over frames have two for each (Scargle, Astrophysical Journal 263,
         835 (1982), eq. 10 and 13). In steps of a quarter cycle, trials are TRIALS a cycle. Where lines vary by more
-        than their errors, all frequencies do: P is then measured by its mean elsewhere, further than three quarters of a cycle off,
-        and F is asked instead of chi2."""
+        than their errors, all frequencies do: P is then measured by its mean further than three quarters of a cycle
+        off, and F is asked instead of chi2."""
         from scipy.special import fdtrc, gammaincc
 
         weighed = [r * g for r, g in zip(residuals, self.signals)]
