@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from optics.light.renderer import everywhere
 from optics.scene.parameter import Values
 
 if TYPE_CHECKING:
@@ -35,7 +36,8 @@ def coordinates(model: SceneModel, values: Values, index: int, seed: int = 0) ->
             "frame": np.full((count, 1), float(index)),
             **{k: v[..., 0] for k, v in frame.readings.items()},
         }
-    hits = model.renderer.hits(now)
+    with everywhere(model.renderer):
+        hits = model.renderer.hits(now)
     view = model.developer.view(now)
     emission = _inclination(_to_camera(hits), hits.normal)
     incidence, distance, shadow, rim = _light(model, now, hits)
@@ -113,7 +115,8 @@ def lit_geometry(model: SceneModel, values: Values, frame: int) -> dict[str, np.
     if model.captures.table is not None:
         return {}
     now, scene, renderer = model.turn_to(values, frame), model.scene, model.renderer
-    hits = renderer.hits(now)
+    with everywhere(renderer):
+        hits = renderer.hits(now)
     p, n = hits.position, hits.normal
     eye = _to_camera(hits)
     to_camera = _unit(eye)

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from optics.light.renderer import everywhere
 from optics.scene.parameter import Values
 
 if TYPE_CHECKING:
@@ -62,7 +63,8 @@ def contact(model: SceneModel, index: int) -> np.ndarray:
     if is_plate(model, index):
         offset, whole = on_balls(model, index)
         return whole & (np.linalg.norm(offset, axis=-1) < INNER)
-    hits = renderer.hits(now)
+    with everywhere(renderer):
+        hits = renderer.hits(now)
     x, y = (np.where(hits.valid, hits.position[..., k], 0) for k in (0, 1))
     return (renderer.contact_weight(now, x.ravel(), y.ravel()).reshape(hits.shape) > 0.5) & hits.valid
 
@@ -71,7 +73,8 @@ def on_balls(model: SceneModel, index: int) -> tuple[np.ndarray, np.ndarray]:
     """((H, W, 2) offset on the untouched face from the nearest ball's middle over the radius, (H, W) bool: that ball is
     whole in view)."""
     now, gel = model.at(Values(), index), model.scene.gel.name
-    face = model.renderer.hits(model.untouched(dict(now))).position[..., :2]
+    with everywhere(model.renderer):
+        face = model.renderer.hits(model.untouched(dict(now))).position[..., :2]
     return _nearest_ball(face, now, gel)
 
 

@@ -36,6 +36,7 @@ import numpy as np
 
 from optics.captures.importing import POSE, PRIORS
 from optics.errors import Underdetermined
+from optics.light.renderer import everywhere
 from optics.scene.parameter import Values
 
 if TYPE_CHECKING:
@@ -443,7 +444,8 @@ def tables(added: bool = False) -> list[list[Table]]:
 
 def tilt_of(model: SceneModel, now: dict[str, Any]) -> np.ndarray:
     """(H, W, 3): normal of the face towards the camera less (0, 0, 1), at all values of a frame; 0 beside the face."""
-    hits = model.renderer.hits(now)
+    with everywhere(model.renderer):
+        hits = model.renderer.hits(now)
     normal = hits.normal * np.array([1, 1, -1])  # the camera stands at -z
     return np.where(hits.valid[..., None], normal - np.array([0, 0, 1]), 0)
 

@@ -29,6 +29,7 @@ from optics.scene.declare import IMAGE_STAGES, Effect
 from optics.scene.images import SIDE, of_pixels, repeated
 from optics.spectra.reading import FILES, read_channels
 
+LENSES = 4  # of which the geometry of pixels is kept
 STEP = 1e-30  # of the complex step; far below rounding, far above underflow
 
 
@@ -87,11 +88,27 @@ class Developer:
         self.neutral = {n: p.neutral for n, p in camera.numbers.items()}
         self.effects = {stage: camera.registry.at_stage(camera.kind, stage) for stage in IMAGE_STAGES}
         self.v, self.u = np.mgrid[: self.height, : self.width] + 0.5
+        self._lens_kept: dict[tuple, tuple] = {}
         self.site = None
         mosaic = getattr(camera, "mosaic", ())
         if mosaic:
             cell = np.radians(np.array(mosaic, float))
             self.site = cell[np.ix_(*(np.arange(n) % m for n, m in zip((self.height, self.width), cell.shape)))]
+
+    def _normalised(self, own: Mapping[str, Any]) -> tuple:
+        """x, y and the tangent of the field angle of each pixel, and the focal length; the latest are kept, as all
+        frames have one lens."""
+        key = tuple(own.values())
+        kept = not any(np.ndim(value) for value in key)
+        if not kept or key not in self._lens_kept:
+            x, y, focal = self.camera.normalised(SimpleNamespace(**own), self.u, self.v)
+            found = x, y, np.hypot(x, y), focal
+            if not kept:
+                return found
+            for image in map(np.asarray, found):
+                image.flags.writeable = False
+            self._lens_kept = {key: found} if len(self._lens_kept) >= LENSES else {**self._lens_kept, key: found}
+        return self._lens_kept[key]
 
     def view(self, values: Mapping[str, complex]) -> SimpleNamespace:
         """What an image function sees as `camera`: every parameter of the camera, and the geometry of its pixels.
@@ -113,14 +130,14 @@ class Developer:
             with np.errstate(divide="ignore"):
                 return self.camera.astray(SimpleNamespace(**own), self.u, self.v, self.distances(values))
 
-        x, y, focal = self.camera.normalised(SimpleNamespace(**own), self.u, self.v)
+        x, y, tan, focal = self._normalised(own)
         return SimpleNamespace(
             **own,
             u=self.u,
             v=self.v,
             px=x,
             py=y,
-            tan=np.hypot(x, y),
+            tan=tan,
             focal=focal,
             width=self.width,
             height=self.height,

@@ -18,6 +18,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import repeat
 from types import SimpleNamespace
 
@@ -25,7 +26,7 @@ import numpy as np
 
 from optics.errors import Apart, BadScene
 from optics.light import paths
-from optics.light.samples import Finer, Hits, LedImage, Sample, around, creases, edges
+from optics.light.samples import Finer, Hits, LedImage, Sample, Traced, around, creases, edges
 from optics.light.together import Group, alike, numbers_of
 from optics.processes import return_memory
 from optics.scene.images import bend, finer_of, from_parts, in_parts, repeated
@@ -88,6 +89,10 @@ class Pixels:
     """Pixels (H, W) of an image, the same only as themselves: part of the keys of images that are kept."""
 
     mask: np.ndarray
+
+    @cached_property
+    def traced(self) -> Traced:
+        return Traced(self.mask)
 
 
 @contextmanager
@@ -193,7 +198,8 @@ class Renderer:
         self.together: set[str] = set()  # LEDs whose images are wanted of the same geometry
         self.asked: set[str] = set()  # parameters whose derivatives will be asked for, see `asking`
         self._slopes: dict[tuple, tuple[LedImage, dict[str, tuple]]] = {}  # those that were made with others
-        # those that take finer samples where they need them, and all directions of second reflections; None: all
+        # those whose centres are followed, which take finer samples where they need them, and all directions of second
+        # reflections; None: all
         self.wanted: Pixels | None = None
         # whether something of the scene must be asked of each LED by itself: of plugins of one's own nobody knows
         self.apart = bool(scene.registry.own_files)
@@ -319,14 +325,18 @@ class Renderer:
         return Sample(si, weight, origin)
 
     def hits(self, values: Mapping) -> Hits:
-        """Primary hits at pixel centres for a geometry; kept."""
-        key = self.geometry(values)
-        if key in self._hits:
-            self._hits.move_to_end(key)
-            return self._hits[key]
+        """Primary hits for a geometry, at the centres of all pixels or of those that `wanted` ones need; kept."""
+        geometry, wanted = self.geometry(values), self.wanted
+        key = (wanted, geometry)
+        for kept in (key, (None, geometry)):
+            if kept in self._hits:
+                self._hits.move_to_end(kept)
+                return self._hits[kept]
         self.apply(values)
-        v, u = np.mgrid[: self.height, : self.width] + 0.5
-        hits = Hits(self._trace(u.ravel(), v.ravel()), self.height, self.width)
+        traced = None if wanted is None else wanted.traced
+        index = np.arange(self.height * self.width) if traced is None else traced.index
+        v, u = (place + 0.5 for place in divmod(index, self.width))
+        hits = Hits(self._trace(u, v), self.height, self.width, traced)
         hits.eye = self._eye()
         if self.crowded:
             hits.edges |= creases(np.where(hits.valid[..., None], hits.normal, 0.0)) | self._parted(values)
@@ -335,7 +345,7 @@ class Renderer:
         self._hits[key] = hits
         while len(self._hits) > self.remember:
             self._hits.popitem(last=False)
-        self._make_room(hits, hits.valid.size)
+        self._make_room(hits, hits.size)
         return hits
 
     def _bare(self, hits: Hits) -> bool:
@@ -367,7 +377,7 @@ class Renderer:
         images = self._images.values()
         rays: dict[Hits, dict[int, int]] = {}  # geometry -> ends of camera rays by the samples that hold them
         for hits in (*(i.hits for i in images), *self._hits.values()):
-            rays.setdefault(hits, {0: hits.valid.size})
+            rays.setdefault(hits, {0: hits.size})
         for image in images:  # of one geometry, they may share their finer samples
             rays[image.hits][id(image.finer)] = image.finer.size
         size = {hits: PER_RAY * sum(own.values()) for hits, own in rays.items()}
@@ -410,10 +420,7 @@ class Renderer:
                 continue
             own = hits.si.is_valid() & (hits.si.bsdf() == mi.BSDFPtr(m))
             paint = dr.select(own, m.reflectance.eval(hits.si, own), 0.0)[0]
-            own, paint = (
-                np.array(own).reshape(hits.shape),
-                np.broadcast_to(np.array(paint), hits.valid.size).reshape(hits.shape),
-            )
+            own, paint = hits.image(own), hits.image(paint)
             if own.any():
                 low, high = around(np.where(own, paint, paint[own].mean()))
                 found |= high - low > PAINTED * paint[own].max()
@@ -533,7 +540,7 @@ class Renderer:
 
     def _alike(self, hits: Hits, leds: Sequence[str]) -> list[list[str]]:
         """The LEDs in groups that are rendered at once."""
-        most = TOGETHER // hits.valid.size
+        most = TOGETHER // hits.size
         if not self.at_once or len(leds) < 2:
             return [[name] for name in leds]
         faces = [s.bbox().max.z for s in self._world().shapes() if _is_window(s)]
@@ -555,11 +562,11 @@ class Renderer:
             return self._render_crowded(hits, led, seed)
         part = self.scene.leds[led]
         visible = self._unshaded(hits, part)
-        rim = self._joint_rim(hits) if self.layered else self._rim(hits, self._seen(visible))
+        rim = self._joint_rim(hits) if self.layered else self._rim(hits, self._seen(hits, visible))
         index, bent, share = self._sampled(hits, part, rim)
         finer = self._finer(hits, index, bent)
         rim_visible = self._visible(finer.sample.si, part) if len(index) else None
-        image = LedImage(led, hits, rim, index, finer, visible, rim_visible, self._seen(visible).mean(0) > 0.5)
+        image = LedImage(led, hits, rim, index, finer, visible, rim_visible, self._seen(hits, visible).mean(0) > 0.5)
         image.share = share
         image.raw = self._direct(image)
         if not self.layered:
@@ -581,11 +588,11 @@ class Renderer:
         """The images of alike LEDs: rays, shadows and shading of all of them at once; {} where that would be too many
         rays, as on a painted face."""
         parts = [self.scene.leds[name] for name in leds]
-        group = Group(parts, hits.sample, hits.valid.size)
+        group = Group(parts, hits.sample, hits.size)
         group.visible = self._reached(
             hits, parts, lambda: self._visible(group.centres().si, group.at_centres(), hits.bare)
         )
-        seen = self._seen(group.visible).reshape(-1, len(parts), *hits.shape)
+        seen = self._seen(hits, group.visible).reshape(-1, len(parts), *hits.shape)
         rims = self._rim(hits, seen)
         indices, few, shares = zip(*(self._sampled(hits, part, rim) for part, rim in zip(parts, rims)))
         few = [np.isin(np.arange(len(index)), bent) for index, bent in zip(indices, few)]
@@ -603,7 +610,7 @@ class Renderer:
         for k, name in enumerate(leds):
             lit = seen[:, k].mean(0) > 0.5
             image = found[name] = LedImage(name, hits, rims[k], indices[k], finer[k], None, None, lit, group)
-            image.share, image.raw = shares[k], raw[k]
+            image.share, image.raw = shares[k], (hits.everywhere(raw[k][0]), raw[k][1])
             image.radiance = self._mix(image, image.raw)
         return found
 
@@ -624,13 +631,14 @@ class Renderer:
         if not self.crowded:
             return image.rim, image.lit
         self.apply(values)
-        visible = self._unshaded(image.hits, self.scene.leds[led])
-        seen = self._seen(visible)
-        return self._rim(image.hits, seen), seen.mean(0) > 0.5
+        hits = image.hits
+        seen = self._seen(hits, self._unshaded(hits, self.scene.leds[led]))
+        return self._rim(hits, seen), seen.mean(0) > 0.5
 
-    def _seen(self, visible) -> np.ndarray:
-        """(points of the source, H, W)"""
-        return np.array(visible).reshape(-1, self.height, self.width)
+    def _seen(self, hits: Hits, visible) -> np.ndarray:
+        """(points of the source and lights, H, W) of what is visible from the centres that were followed."""
+        seen = np.array(visible).reshape(-1, hits.size)
+        return hits.everywhere(seen.T).T.reshape(-1, *hits.shape)
 
     def _rim(self, hits: Hits, seen: np.ndarray) -> np.ndarray:
         """(..., H, W) pixels at a rim of the geometry, or of the shadow of a point of a source, of sources that reach
@@ -640,7 +648,7 @@ class Renderer:
     def _joint_rim(self, hits: Hits) -> np.ndarray:
         """Pixels at a rim for any light: in scenes with layers one set of finer samples serves all."""
         if hits.joint is None:
-            rims = (self._rim(hits, self._seen(self._unshaded(hits, part))) for part in self.scene.leds.values())
+            rims = (self._rim(hits, self._seen(hits, self._unshaded(hits, part))) for part in self.scene.leds.values())
             hits.joint = np.logical_or.reduce([hits.edges, *rims])
         return hits.joint
 
@@ -895,7 +903,7 @@ class Renderer:
         fine = self._each_band(rim, image.led) if len(image.index) else None
         if self.crowded:
             return np.zeros((self.height * self.width, self.bands)), fine
-        return self._each_band(centre, image.led).reshape(self.height * self.width, self.bands), fine
+        return image.hits.everywhere(self._each_band(centre, image.led).reshape(-1, self.bands)), fine
 
     def _mix(self, image: LedImage, raw: Sequence, weights: tuple = (1.0, 1.0), side: int = 1) -> np.ndarray:
         """(H, W, B) from pixel centres and, where the rim is, from the mean of the finer samples, by its share; of
@@ -1035,7 +1043,7 @@ class Renderer:
             own = self.led_keys[led]
             asked = [k for k in own if k in self.asked and self.scene.parameters[k].how == "ad"] if key in own else []
             others = [k for k in asked if k != key and k not in found]
-            rays = [image.finer.size, image.hits.valid.size]
+            rays = [image.finer.size, image.hits.size]
             if image.group is not None:
                 rays = [sum(image.group.sizes), rays[1] * len(image.group.names)]
             at_once = max(int(AT_ONCE / max(rays)), 1)
@@ -1157,7 +1165,7 @@ class Renderer:
             return (image.finer.sample, lambda given: lamp) if group is None else (group.finer, group.at_finer)
 
         lit = image if group is None else group
-        pixels = self.height * self.width * max(len(mates), 1)
+        pixels = image.hits.size * max(len(mates), 1)
         rays = image.finer.size if group is None else sum(group.sizes)
         centres: Iterable[np.ndarray] = repeat(np.zeros((pixels, self.bands)))
         if not self.crowded:
@@ -1167,10 +1175,13 @@ class Renderer:
         if sampled:
             made = self._each_band_of(lambda: rims(at_finer, lit.rim_visible), image.led)
             finely = [np.broadcast_to(m, (rays, self.bands)) for m in made]
+        wide = image.hits.everywhere
         if group is None:
-            return {image: dict(zip(keys, zip(centres, finely)))}
+            return {image: {k: (wide(c), f) for k, c, f in zip(keys, centres, finely)}}
         each = zip(*(group.apart(c, f) for c, f in zip(centres, finely)))
-        return {m: {_of(k, image.led, m.led): r for k, r in zip(keys, raw)} for m, raw in zip(mates, each)}
+        return {
+            m: {_of(k, image.led, m.led): (wide(c), f) for k, (c, f) in zip(keys, raw)} for m, raw in zip(mates, each)
+        }
 
     def bounced(
         self, values: Mapping, led: str, seed: int = 0, component: int = 0, roughly: bool = False
@@ -1307,11 +1318,9 @@ class Renderer:
         if not self.glows(values) or component and not self.layered:
             return self._dark()
         if not self.layered:
-            return self._parts_of(
-                np.broadcast_to(self._shone(values, self.hits(values).sample), (self.height * self.width, self.bands))
-                .reshape(self.height, self.width, self.bands)
-                .astype(float)
-            )
+            hits = self.hits(values)
+            shone = hits.everywhere(np.broadcast_to(self._shone(values, hits.sample), (hits.size, self.bands)))
+            return self._parts_of(shone.reshape(*hits.shape, self.bands).astype(float))
         image = self.glow(values)
         own = np.arange(self.bands) if self.integral is None else np.flatnonzero(self.integral.white)
         return self._layered(image, zip(image.raw, self.weights(values, image, component)), own)

@@ -13,6 +13,7 @@ from optics.light import paths
 # difference of a pixel's mean normal from that at its middle, above which finer samples are taken: a fifth of a grey
 # level in 200
 BENT = 1e-3
+LATTICE = 4  # px from one to the next of the pixels that are followed where none is wanted
 CREASE = 25.0  # deg from pixel to pixel: what is no smooth surface
 
 
@@ -25,19 +26,40 @@ class Sample(NamedTuple):
     path: paths.Path | None = None
 
 
-class Hits:
-    """Primary hits of one geometry: si, weight, origin (Dr.Jit), and what they show as numpy images."""
+class Traced:
+    """Pixels whose centres camera rays are sent through where not all are wanted: these, their neighbours, which tell
+    how a pixel varies, and every LATTICE-th of the others each way, which stand for those about them.
 
-    def __init__(self, sample: Sample, height: int, width: int):
-        self.sample = sample
+    index     their numbers;   nearest   (H W,) of each pixel, the place in `index` of the one that stands for it"""
+
+    def __init__(self, wanted: np.ndarray):
+        from scipy.ndimage import binary_dilation, distance_transform_edt
+
+        traced = binary_dilation(wanted, np.ones((3, 3), bool))
+        traced[LATTICE // 2 :: LATTICE, LATTICE // 2 :: LATTICE] = True
+        self.index = np.flatnonzero(traced)
+        place = np.zeros(traced.shape, np.int32)
+        place[traced] = np.arange(len(self.index))
+        rows, columns = distance_transform_edt(~traced, return_distances=False, return_indices=True)
+        self.nearest = place[rows, columns].ravel()
+
+
+class Hits:
+    """Primary hits of one geometry: si, weight, origin (Dr.Jit), and what they show as numpy images.
+
+    traced   the pixels whose centres were followed; None: all"""
+
+    def __init__(self, sample: Sample, height: int, width: int, traced: Traced | None = None):
+        self.sample, self.traced = sample, traced
         self.si, self.weight, self.origin, self.path = sample
         self.shape = (height, width)
+        self.size = height * width if traced is None else len(traced.index)
         self.rims: dict = {}
         self.joint: np.ndarray | None = None
         self.lit: dict[tuple[str, ...], tuple] = {}  # what lights see of the pixels' centres, with their numbers then
         self.eye = np.zeros(3)  # where the camera stood
         self.bare = False  # whether nothing casts a shadow on what is seen, and no pixel needs finer samples
-        self.valid = np.array(self.si.is_valid()).reshape(height, width)
+        self.valid = self.image(self.si.is_valid())
         self.edges = edges(self.valid)
         if self.path is not None:  # what is passed, and what is met, changes at an edge
             for met in (self.path.shape, *self.path.regions, *(step.part for step in self.path.steps)):
@@ -49,16 +71,21 @@ class Hits:
             else bends(np.where(self.valid[..., None], self.normal, 0.0))
         )
 
+    def everywhere(self, values: np.ndarray) -> np.ndarray:
+        """(H W, ...) of values (size, ...) at the centres that were followed."""
+        return values if self.traced is None else values[self.traced.nearest]
+
     def image(self, values) -> np.ndarray:
-        return np.array(values).reshape(self.shape)
+        """(H, W) of what one number a ray (Dr.Jit) is."""
+        return self.everywhere(np.broadcast_to(np.array(values), self.size)).reshape(self.shape)
 
     @property
     def position(self) -> np.ndarray:
-        return np.array(self.si.p).T.reshape(*self.shape, 3)
+        return self.everywhere(np.array(self.si.p).T).reshape(*self.shape, 3)
 
     @property
     def normal(self) -> np.ndarray:
-        return np.array(self.si.sh_frame.n).T.reshape(*self.shape, 3)
+        return self.everywhere(np.array(self.si.sh_frame.n).T).reshape(*self.shape, 3)
 
 
 class Finer:

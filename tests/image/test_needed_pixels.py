@@ -1,5 +1,5 @@
-"""Finer samples only where a fit looks: a mask that leaves a part of the image changes no value that is used, and costs
-the rest its finer samples alone."""
+"""Camera rays, and finer samples, only where a fit looks: a mask that leaves a part of the image changes no value that
+is used."""
 
 from dataclasses import replace
 
@@ -27,10 +27,13 @@ def test_values_that_are_used_stay(bench, blur, second):
     model.frames[0] = replace(frame, mask=mask, image=image)
     try:
         whole, slopes = next(iter(model.derivatives(values, variables)))
+        model.renderer.forget_hits()
         with model.where_used():
             sparing, own = next(iter(model.derivatives(values, variables)))
             needed = model._needed(0).mask
             assert needed[mask].all() and not needed.all()
+            followed = [hits.size for key, hits in model.renderer._hits.items() if key[0] is model._needed(0)]
+            assert followed and max(followed) < 0.5 * mask.size
         again = model.predict(values)[0]
         far = ~model._needed(0).mask
     finally:
@@ -43,6 +46,7 @@ def test_values_that_are_used_stay(bench, blur, second):
         left = np.abs(own[key] - slopes[key])[mask].max() / np.abs(slopes[key]).max()
         # a blur far below a pixel rings: of the slope three pixels beside it brings 2 V/9 of V = .16 px^2, a few per
         # cent, of which finer samples change a part
-        assert left < (5e-3 if blur else 1e-6), key
+        # that of the press is a difference of two images in single precision, a thousandth of them
+        assert left < (5e-3 if blur else 1e-5 if key == "gel.press_x" else 1e-6), key
     assert np.array_equal(again, whole)  # outside of the context, all is as before
     assert np.abs(sparing - whole)[far].max() > 1e-4 * scale  # and within it something was left out
