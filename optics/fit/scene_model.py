@@ -317,8 +317,7 @@ class SceneModel:
         same gel for all presses and whatever they are like."""
         gel = self.scene.gel.name
         keys = (self.scene.key(gel, role) for role in ("press x", "press y", "press depth"))
-        pressing = (f"{gel}.{name}" for name in getattr(self.scene.gel, "pressing", ()))
-        same = {key: self.base[key] for key in pressing if key in self.base}
+        same = {key: value for key, value in self.base.items() if self._rests(key)}
         return {**now, **same, **dict.fromkeys((key for key in keys if key), 0.0)}
 
     def _at_rest(self, untouched: Mapping, index: int, seed: int) -> np.ndarray:
@@ -329,7 +328,10 @@ class SceneModel:
     def _rests(self, key: str) -> bool:
         """Whether a parameter does nothing while the gel is untouched."""
         name, _, parameter = key.rpartition(".")
-        return name == self.scene.gel.name and parameter in self.scene.gel.pressing
+        if name != self.scene.gel.name:
+            return False
+        own = self.scene.parameters.get(key)
+        return parameter in getattr(self.scene.gel, "pressing", ()) or (own is not None and own.when_pressed)
 
     def predict(self, values: Values, frames: Sequence[int] | None = None, seed: int = 0) -> list[np.ndarray]:
         """Noise-free DN (H, W, C) of each frame.

@@ -82,6 +82,7 @@ class Parameter:
     through     name of the part's setting, or 'clock' for the scene's, through whose changes alone it shows: where
                 that has one value in all frames, it acts as other parameters do (a wobble as a transmittance, a scale
                 as an offset), and no effect frees it there
+    when_pressed    True where it does nothing while nothing presses: images of the gel at rest serve all its values
     role        what it is to the library, one of ROLES; '' for what only the part itself and effects read
     band        number of the spectral band that it belongs to, from 0; None: of all bands
     free        what a calibration solves for unless its setup says otherwise: 'all' (one value for all frames), 'press'
@@ -107,6 +108,7 @@ class Parameter:
     period: float = math.inf
     pair: str = ""
     through: str = ""
+    when_pressed: bool = False
     squared: bool = False
     saturates: float = math.inf
     role: str = ""

@@ -55,6 +55,7 @@ effect = Effect(
             "gain g of the coating where the plate between balls touches it",
             neutral=0.0,
             plausible=0.05,
+            when_pressed=True,
         ),
     ),
     acts=("contact_distance",),

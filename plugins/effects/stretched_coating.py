@@ -59,6 +59,7 @@ effect = Effect(
             "gain k of the coating's light per areal stretch of the face",
             neutral=0.0,
             plausible=0.3,
+            when_pressed=True,
         ),
     ),
     acts=("radius",),

@@ -51,6 +51,7 @@ effect = Effect(
             "gain g of the coating where something touches it",
             neutral=0.0,
             plausible=0.05,
+            when_pressed=True,
         ),
     ),
     acts=("contact_distance",),

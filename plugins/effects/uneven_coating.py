@@ -51,7 +51,14 @@ def check_two_contacts():
 
 def coefficient(name: str, unit: str, most: float, plausible: float, of: str) -> Parameter:
     return Parameter(
-        name, unit, 0.0, (-most, most), f"what shows through the coating, by {of}", neutral=0.0, plausible=plausible
+        name,
+        unit,
+        0.0,
+        (-most, most),
+        f"what shows through the coating, by {of}",
+        neutral=0.0,
+        plausible=plausible,
+        when_pressed=True,
     )
 
 

@@ -149,3 +149,22 @@ def test_presses_share_the_gel_at_rest_whatever_they_are_like(scene):
     )
     curved = model.untouched(model.at(Values({"gel.curve_xx": 2e-3}), 0))
     assert model.renderer.geometry(plain) == model.renderer.geometry(other) != model.renderer.geometry(curved)
+
+
+def test_what_shows_under_a_press_alone_leaves_the_gel_at_rest(scene):
+    """Declared of parameters (`when_pressed`), and true: the image at rest is the same to the bit, that of a press is
+    not, but for what only plates of balls show."""
+    shape = (int(SMALL["height"]), int(SMALL["width"]), 3)
+    frame = Frame("press", np.zeros(shape, np.float32), parameters={"gel.press_depth": 0.8, "gel.stretch": 0.04})
+    model = SceneModel(scene, Captures(Path("."), str(scene.path), [frame], noise=Noise(0.1, 1.0, 0.0, 255.0, 0.0)))
+    now = model.at(Values(), 0)
+    plain = model.untouched(now)
+    at_rest, pressed = model.renderer.radiance(plain), model.renderer.radiance(now)
+    keys = [key for key, p in scene.parameters.items() if p.when_pressed]
+    assert {"gel.shown_through", "gel.stretch_gain", "gel.uneven_xy"} <= set(keys)
+    for key in keys:
+        value = 5 * scene.parameters[key].plausible
+        assert model.untouched(model.at(Values({key: value}), 0)) == plain
+        assert np.array_equal(model.renderer.radiance({**plain, key: value}), at_rest), key
+        same = np.array_equal(model.renderer.radiance({**now, key: value}), pressed)
+        assert same == (key == "gel.shown_between"), key
