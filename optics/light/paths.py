@@ -122,7 +122,7 @@ def trace(scene, u: np.ndarray, v: np.ndarray) -> Path:
 
     camera, names = scene.camera, passable(scene)
     n = len(u)
-    o, d = camera.ray(mi.Float(u.astype(np.float32)), mi.Float(v.astype(np.float32)))
+    o, d = camera.ray(mi.Float(np.asarray(u, np.float32)), mi.Float(np.asarray(v, np.float32)))
     zero = mi.Vector3d(dr.zeros(mi.Float64, n))
     direction, origin = mi.Vector3d(d) + zero, mi.Point3d(o) + zero
     # across the image's vertical, as Mitsuba's `stokes` has it

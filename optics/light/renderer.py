@@ -26,7 +26,7 @@ import numpy as np
 
 from optics.errors import Apart, BadScene
 from optics.light import paths
-from optics.light.samples import Finer, Hits, LedImage, Sample, Traced, around, creases, edges
+from optics.light.samples import Finer, Hits, LedImage, Sample, Traced, aligned, around, creases, edges
 from optics.light.together import Group, alike, numbers_of
 from optics.processes import return_memory
 from optics.scene.images import bend, finer_of, from_parts, in_parts, repeated
@@ -309,14 +309,13 @@ class Renderer:
         import mitsuba as mi
 
         with dr.suspend_grad():
+            u, v = aligned(u), aligned(v)
             if self.layered:
                 path = paths.trace(self.scene, u, v)
                 return Sample(path.si, mi.UnpolarizedSpectrum(1.0), path.origin, path)
-            u, v = (mi.Float(a.astype(np.float32)) for a in (u, v))
+            u, v = mi.Float(u), mi.Float(v)
             if self.crowded:
-                o, d, weight = self._rays(
-                    u, v, None if lens is None else [mi.Float(a.astype(np.float32)) for a in lens]
-                )
+                o, d, weight = self._rays(u, v, None if lens is None else [mi.Float(aligned(a)) for a in lens])
                 si, _, origin = self.scene.integrator.reached(self._world(), o, d)
                 si = self.scene.traced.sharpen(si, origin)
             else:
@@ -598,7 +597,10 @@ class Renderer:
         few = [np.isin(np.arange(len(index)), bent) for index, bent in zip(indices, few)]
         if sum(np.where(own, self.bent_side**2, self.rim_samples).sum() for own in few) > MOST_FINER:
             return {}
-        finer = group.split(self._in_pixels(np.concatenate(indices), np.concatenate(few)), list(map(len, indices)))
+        # most pixels take the same for all LEDs: one that takes few is another than one that takes many
+        own, places = np.unique(2 * np.concatenate(indices) + np.concatenate(few), return_inverse=True)
+        places = np.split(places, np.cumsum(list(map(len, indices)))[:-1])
+        finer = group.split(self._in_pixels(own // 2, own % 2 == 1), places)
         if group.finer is not None:
             group.rim_visible = self._visible(group.finer.si, group.at_finer())
         (centres,) = self._bands([self._shade(group.centres(), group.at_centres(), group.visible)])
@@ -1270,7 +1272,7 @@ class Renderer:
             numbers = np.concatenate([own.reshape(-1, BOUNCE_NUMBERS) for _, own in parts])
             v, u = (np.concatenate([place[k] for place, _ in parts]) for k in (0, 1))
             at = [a + numbers[:, k] for k, a in enumerate((u, v))]
-            self._drawn[key] = at, [mi.Float(c) for c in np.ascontiguousarray(numbers[:, 2:].T, np.float32)]
+            self._drawn[key] = at, [mi.Float(aligned(c)) for c in numbers[:, 2:].T]
         return self._drawn[key]
 
     def _cells(self) -> tuple[int, int]:

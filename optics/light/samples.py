@@ -17,6 +17,15 @@ LATTICE = 4  # px from one to the next of the pixels that are followed where non
 CREASE = 25.0  # deg from pixel to pixel: what is no smooth surface
 
 
+def aligned(values: np.ndarray, kind: type = np.float32) -> np.ndarray:
+    """A copy (n,) that begins at a multiple of 64 bytes. Dr.Jit reads numpy's memory where it lies, and compiles each
+    kernel anew for what does not begin so."""
+    memory = np.empty(values.size * np.dtype(kind).itemsize + 64, np.uint8)
+    found = memory[-memory.ctypes.data % 64 :][: memory.size - 64].view(kind)
+    found[:] = values.ravel()
+    return found
+
+
 class Sample(NamedTuple):
     """Camera rays at their ends (Dr.Jit), and in a scene with layers the paths that they took."""
 

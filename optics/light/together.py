@@ -11,7 +11,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from optics.errors import Apart
-from optics.light.samples import Finer, Sample
+from optics.light.samples import Finer, Sample, aligned
 
 PLAIN = (bool, int, float, str, tuple, list, type(None))  # what may be equal in all lights
 ALIKE = ("numbers", "words")  # the same of a class
@@ -156,10 +156,10 @@ class Group:
 
         self.lights, self.sample, self.pixels = tuple(lights), sample, pixels
         self.names = [light.name for light in lights]
-        self.visible = self.rim_visible = self.finer = None
+        self.visible = self.rim_visible = self._ends = None
         self.sizes = [0] * len(self.names)
         lanes = dr.arange(mi.UInt32, len(self.names) * pixels)
-        self._pixel, self._light, self._fine_light = lanes % pixels, lanes // pixels, None
+        self._pixel, self._light, self._fine_light, self._end = lanes % pixels, lanes // pixels, None, None
 
     def centres(self) -> Sample:
         """The ends of rays at pixels' centres, in every lane."""
@@ -173,18 +173,33 @@ class Group:
         """The lights, in every lane of `finer`."""
         return Together(self.lights, self._fine_light, given)
 
-    def split(self, finer: Finer, pixels: Sequence[int]) -> list[Finer]:
-        """Take the finer samples of all LEDs, of so many pixels each; gives those of each."""
+    @property
+    def finer(self) -> Sample | None:
+        return gathered(self._ends, self._end)
+
+    def split(self, finer: Finer, places: Sequence[np.ndarray]) -> list[Finer]:
+        """Take finer samples that LEDs share, of each LED the places of its pixels among theirs; gives those of
+        each."""
         import mitsuba as mi
 
-        counts = np.split(finer.counts, np.cumsum(pixels)[:-1])
-        self.sizes, self.finer = [int(own.sum()) for own in counts], finer.sample
-        self._fine_light = mi.UInt32(np.repeat(np.arange(len(pixels), dtype=np.uint32), self.sizes))
-        at = zip(*(np.split(place, np.cumsum(self.sizes)[:-1]) for place in finer.at))
-        return [Finer(own, self._own_finer(k), places) for k, (own, places) in enumerate(zip(counts, at))]
+        starts = np.cumsum(finer.counts) - finer.counts
+        counts = [finer.counts[own] for own in places]
+        ends = [
+            np.repeat(starts[own] + count - np.cumsum(count), count) + np.arange(count.sum())
+            for own, count in zip(places, counts)
+        ]
+        self.sizes, self._ends = [len(own) for own in ends], finer.sample
+        self._end = mi.UInt32(aligned(np.concatenate(ends), np.uint32))
+        self._fine_light = mi.UInt32(aligned(np.repeat(np.arange(len(places)), self.sizes), np.uint32))
+        return [
+            Finer(count, self._own_finer(k), (finer.at[0][own], finer.at[1][own]))
+            for k, (count, own) in enumerate(zip(counts, ends))
+        ]
 
     def _own_finer(self, k: int):
-        return (lambda: gathered(self.finer, self._fine(k))) if self.sizes[k] else None
+        if not self.sizes[k]:
+            return None
+        return lambda: gathered(self._ends, gathered(self._end, self._fine(k)))
 
     def _fine(self, k: int):
         """Lanes of the finer samples of a light."""

@@ -18,6 +18,7 @@ References
     three rotations one after the other: Goldstein, Classical Mechanics, 4.4.
 """
 
+from optics.scene.boards import on_board
 from optics.scene.checking import agree, made
 from optics.scene.declare import Part
 from optics.scene.mitsuba_parts import Declared
@@ -71,6 +72,10 @@ def build():
         def place(self, at, turn):
             """Where a point `at` of the board's frame stands, mm."""
             return mi.Point3f(self.x, self.y, self.z) + self.turned(self.about_axis(mi.Vector3f(at), turn, self.scale))
+
+        def stands(self, at, turn):
+            """The same in numbers, without waiting for the device."""
+            return tuple(map(float, on_board(at, turn, self.held)))
 
         # -- Mitsuba: it sends no light -------------------------------------------------------------------------------
         def sample_direction(self, it, sample, active=True):

@@ -237,9 +237,10 @@ def build():
 
         def stands(self):
             """The position as three floats, mm."""
+            at = tuple(self.number(n) for n in "xyz")
             if self.board is None:
-                return tuple(self.number(n) for n in "xyz")
-            return tuple(float(c[0]) for c in self.position())
+                return at
+            return self.board.stands(at, self.number("turn") if "turn" in self.numbers else 0.0)
 
         def axis(self):
             side, up, forward = self.frame

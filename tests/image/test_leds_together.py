@@ -5,6 +5,7 @@ import pytest
 
 from optics.errors import Apart
 from optics.light.renderer import Renderer
+from optics.light.samples import aligned
 from optics.light.together import Together, alike
 from optics.scene import loader
 
@@ -208,3 +209,13 @@ def test_another_press_needs_no_other_kernel(mitsuba):
             press(x)
         made = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
     assert len(made) > 30 and all(k["cache_hit"] for k in made)
+
+
+def test_arrays_begin_where_every_kernel_can_read_them():
+    """numpy's own begin at odd multiples of 16 bytes, or at even ones: each was a kernel of its own."""
+    for n in (1, 7, 1000, 100_001):
+        values = np.random.default_rng(n).random((1, n))
+        found = [aligned(values), aligned(values * 1e6, np.uint32)]
+        assert all(a.ctypes.data % 64 == 0 and a.shape == (n,) and a.flags.c_contiguous for a in found)
+        assert np.array_equal(found[0], values.astype(np.float32)[0])
+        assert np.array_equal(found[1], (values * 1e6).astype(np.uint32)[0])
