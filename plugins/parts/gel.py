@@ -517,7 +517,7 @@ def build():
             n = self.number if self.recalled is None else self.recalled.__getitem__
             if n("press_depth") <= 0:
                 return dr.zeros(mi.Float, 1)
-            s, x, y, xx, xy, yy = map(n, contact.STRETCH)
+            s, x, y, xx, xy, yy = (dr.opaque(mi.Float, n(name)) for name in contact.STRETCH)
             return s + (x + xx * p.x + xy * p.y) * p.x + (y + yy * p.y) * p.y
 
         def recall(self, values):
@@ -539,8 +539,9 @@ def build():
                     filter_mode=dr.FilterMode.Linear,
                     wrap_mode=dr.WrapMode.Clamp,
                 )
-            count, pitch = len(touch.values), touch.pitch
-            u, v = (((x - n(key)) / pitch + count / 2) / count for x, key in ((p.x, "press_x"), (p.y, "press_y")))
+            # opaque: numbers would be compiled into a kernel for each press
+            width = dr.opaque(mi.Float, len(touch.values) * touch.pitch)
+            u, v = ((x - dr.opaque(mi.Float, n(key))) / width + 0.5 for x, key in ((p.x, "press_x"), (p.y, "press_y")))
             return self.touch_texture.eval(mi.Point2f(u, v))[0]
 
         # -- the way of light in the gel ------------------------------------------------------------------------------
