@@ -278,7 +278,7 @@ def lit_point(powers):
         "above.x": 2.0,
     }
     return SimpleNamespace(
-        renderer=SimpleNamespace(hits=lambda now: hits, image=lambda now, led: np.ones((1, 1, 3))),
+        renderer=SimpleNamespace(wanted=None, hits=lambda now: hits, image=lambda now, led: np.ones((1, 1, 3))),
         turn_to=lambda values, frame: now,
         captures=SimpleNamespace(table=None),
         lit=lambda now: powers,
