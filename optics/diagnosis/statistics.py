@@ -34,7 +34,8 @@ VISIBLE = 1e-6  # survival below which normal equations in double precision cann
 DRAWS = 40_000  # of the simulated maximum: 1 % of them are 400, known to 5 %
 BINS = 16  # of a curve along a coordinate
 RIPPLES, FREQUENCIES = 8, 1000  # frequencies from which, and up to which, the strongest one is looked for
-CYCLES, TRIALS = 2, 2  # from which on a gain of whole lines is looked for; trials a cycle
+# Cycles from which on a gain of whole lines is looked for, trials a cycle, and the lines that a frame must have
+CYCLES, TRIALS, LINES = 2, 2, 16
 NARROW = 8  # cosines per side that count as low frequency
 
 
@@ -513,8 +514,9 @@ class Spectrum:
     strongest frequency along rows and columns against all others; and that of a gain of whole rows or columns. p is
     the smallest of the three, times three.
 
-    White noise has the same power in both, whatever its size: an error of the gain changes nothing, structure does.
-    The degrees of freedom that a calibration takes from the low frequencies are counted from the images of J.
+    White noise has the same power in all frequencies, whatever its size: a noise that is stated wrongly changes
+    nothing, structure does. The degrees of freedom that a calibration takes from the low frequencies are counted from
+    the images of J.
     """
 
     def __init__(self, columns: int):
@@ -574,37 +576,43 @@ class Spectrum:
 
     def _bands(self, residuals: Sequence[np.ndarray]) -> float:
         """p of the strongest frequency, of CYCLES or more, of a gain of whole rows or columns, the same in all
-        channels: of each frame (mains light under a rolling shutter) and of all frames together (a read-out).
+        channels: of all frames together (a read-out), and of what each frame has besides (mains light under a rolling
+        shutter).
 
-        The gain of a line in units of its own error is z = sum r g / sqrt(sum r^2 g^2), g the light predicted: no
-        image alone shows what a hundred show together. P(f) = 2 |sum_n z_n exp(-2 pi i f n)|^2 / N of white noise is
-        chi2 with two degrees of freedom, and sums over frames have two for each (Scargle, Astrophysical Journal 263,
-        835 (1982), eq. 10 and 13). In steps of a quarter cycle, trials are TRIALS a cycle. Where lines vary by more
-        than their errors, all frequencies do: P is then measured by its mean further than three quarters of a cycle
-        off, and F is asked instead of chi2."""
+        The gain of a line in units of its own error is z = u / sqrt(v), u = sum r g and v = sum r^2 g^2 of all frames,
+        g the light predicted: no image alone shows what a hundred show together. What a frame f has besides is
+        (u_f - v_f u/v) / sqrt(v_f), which has one degree of freedom less than there are frames. P(f) = 2 |sum_n z_n
+        exp(-2 pi i f n)|^2 / N of white noise is chi2 with two degrees of freedom, and sums over frames have two for
+        each (Scargle, Astrophysical Journal 263, 835 (1982), eq. 10 and 13). In steps of a quarter cycle, trials are
+        TRIALS a cycle. Where lines vary by more than their errors, all frequencies do. P of all frames is then measured
+        by its mean further than three quarters of a cycle off, and F is asked instead of chi2; that of a frame by its
+        own mean. Frames with fewer than LINES lines tell nothing."""
         from scipy.special import fdtrc, gammaincc
 
-        weighed = [r * g for r, g in zip(residuals, self.signals)]
         ps = []
         for axis in (0, 1):
-            u = np.array([w.sum((1 - axis, 2), dtype=float) for w in weighed])
-            v = np.array([(w**2).sum((1 - axis, 2), dtype=float) for w in weighed])
-            held = v > 0
-            z = np.where(held, u / np.sqrt(np.where(held, v, 1.0)), 0.0)
-            mean = u.sum(0) / np.sqrt(np.maximum(v.sum(0), 1e-300))
-            own = (z - mean / math.sqrt(len(z))) * held * math.sqrt(len(z) / max(len(z) - 1, 1))
-            for profiles, order in ((mean[None], 1), (own, len(z) - 1)):
-                lines, n = np.count_nonzero(profiles, 1), len(mean)
-                profiles = profiles[lines >= 16]
-                if not len(profiles) or not order:
-                    continue
-                power = np.abs(np.fft.rfft(profiles, 4 * n, axis=1)[:, 4 * CYCLES :]) ** 2
-                power = power.T @ (order / len(profiles) / lines[lines >= 16])
-                k = int(power.argmax())
-                rest = np.delete(power, slice(max(k - 3, 0), k + 4)) / order
-                scale, known = float(rest.mean()), 2 * order * len(rest) / 4
-                p = fdtrc(2 * order, known, power[k] / scale / order) if scale > 1 else gammaincc(order, power[k])
-                ps.append(float(p) * TRIALS * n / 2)
+            us, vs = [], []
+            for r, g in zip(residuals, self.signals):
+                weighed = r * g
+                v = (weighed**2).sum((1 - axis, 2), dtype=float)
+                if np.count_nonzero(v) >= LINES:
+                    us.append(weighed.sum((1 - axis, 2), dtype=float))
+                    vs.append(v)
+            if not us:
+                continue
+            u, v = np.array(us), np.maximum(np.array(vs), 1e-300)  # u is 0 as well where v is
+            n, gain = u.shape[1], u.sum(0) / v.sum(0)
+            trials = TRIALS * n / 2
+            (power,) = _periodogram(u.sum(0, keepdims=True) / np.sqrt(v.sum(0)))
+            k = int(power.argmax())
+            rest = np.delete(power, slice(max(k - 3, 0), k + 4))
+            scale, known = float(rest.mean()), len(rest) / 2
+            p = fdtrc(2, known, power[k] / scale) if scale > 1 else gammaincc(1, power[k])
+            ps.append(float(p) * trials)
+            if len(u) > 1:
+                powers = _periodogram((u - v * gain) / np.sqrt(v))
+                powers /= np.maximum(powers.mean(1, keepdims=True), 1.0)
+                ps.append(float(gammaincc(len(u) - 1, powers.sum(0).max())) * trials)
         return min(1.0, min(ps, default=1.0) * max(len(ps), 1))
 
     def _ripple(self, residuals: Sequence[np.ndarray]) -> float:
@@ -687,6 +695,13 @@ class Sweeps:
             return Structure(*[float("nan")] * 5)
         p, f, low, free = min(found)
         return Structure(f, min(1.0, p * len(found)), low, free, float("nan"))
+
+
+def _periodogram(profiles: np.ndarray) -> np.ndarray:
+    """|sum_n z_n exp(-2 pi i f n)|^2 / N of profiles (frames, n), at frequencies from CYCLES on in steps of a quarter
+    cycle: of white noise with a mean of 1; N counts what is not 0."""
+    lines = np.maximum(np.count_nonzero(profiles, 1), 1)
+    return np.abs(np.fft.rfft(profiles, 4 * profiles.shape[1], axis=1)[:, 4 * CYCLES :]) ** 2 / lines[:, None]
 
 
 def _ripple_of(t: np.ndarray, r: np.ndarray, taken: int) -> list[tuple[float, float, int, int]]:

@@ -361,9 +361,10 @@ class SceneModel:
 
     @contextmanager
     def where_used(self) -> Iterator[None]:
-        """Within it, predictions take finer samples, and all directions of second reflections, only at pixels that a
-        frame of the same press uses, and beside them: of a mask that leaves a part of the image, a fit need not know
-        the rest well."""
+        """Within it, predictions follow the camera's rays, take finer samples, and all directions of second
+        reflections, only at pixels that a frame of the same press uses, and beside them, and the rest from few: of a
+        mask that leaves a part of the image, a fit need not know the rest well. What a lens brings from there, such as
+        veiling glare, is known as well as these few tell it: to .3 % of a glare."""
         before, self.sparing = self.sparing, True
         try:
             yield

@@ -116,7 +116,7 @@ class Developer:
         u, v (H, W) px; x, y (H, W) normalised coordinates; tan (H, W) tangent of the field angle; focal (px); width,
         height (px); side, parts of a pixel each way that the image has, for effects that are `finer`; astray() (H, W)
         px by which a ray off the pupil's middle misses the chief ray, per mm off it, at the distance that the pixel
-        sees; bands (nm);
+        sees; bands (nm); images of the geometry are shared, and cannot be written to;
         time, the scene's clock, 0 without one, (N, 1, 1) where readings were swept;
         white (B,) radiance per band of white light of radiance 1; settings: all values by key, those of
         other parts too, (N, 1, 1) where readings were swept."""

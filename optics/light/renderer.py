@@ -86,7 +86,7 @@ FEW_BOUNCES = 64
 
 @dataclass(frozen=True, eq=False)
 class Pixels:
-    """Pixels (H, W) of an image, the same only as themselves: part of the keys of images that are kept."""
+    """Pixels (H, W) of an image, the same only as themselves: part of the keys of what is kept."""
 
     mask: np.ndarray
 
@@ -97,7 +97,8 @@ class Pixels:
 
 @contextmanager
 def everywhere(renderer) -> Iterator[None]:
-    """Within it all pixels are wanted: for the gel at rest, which frames with other masks share."""
+    """Within it all pixels are wanted: for the gel at rest, which frames with other masks share, and for what is asked
+    of the whole view."""
     wanted, renderer.wanted = renderer.wanted, None
     try:
         yield
@@ -325,12 +326,11 @@ class Renderer:
 
     def hits(self, values: Mapping) -> Hits:
         """Primary hits for a geometry, at the centres of all pixels or of those that `wanted` ones need; kept."""
-        geometry, wanted = self.geometry(values), self.wanted
-        key = (wanted, geometry)
-        for kept in (key, (None, geometry)):
-            if kept in self._hits:
-                self._hits.move_to_end(kept)
-                return self._hits[kept]
+        wanted = self.wanted
+        key = (wanted, self.geometry(values))  # hits of all pixels are others: a difference must not mix the two
+        if key in self._hits:
+            self._hits.move_to_end(key)
+            return self._hits[key]
         self.apply(values)
         traced = None if wanted is None else wanted.traced
         index = np.arange(self.height * self.width) if traced is None else traced.index
@@ -377,8 +377,8 @@ class Renderer:
         rays: dict[Hits, dict[int, int]] = {}  # geometry -> ends of camera rays by the samples that hold them
         for hits in (*(i.hits for i in images), *self._hits.values()):
             rays.setdefault(hits, {0: hits.size})
-        for image in images:  # of one geometry, they may share their finer samples
-            rays[image.hits][id(image.finer)] = image.finer.size
+        for image in images:  # of one geometry, they may share their finer samples, of one group they do
+            rays[image.hits][id(image.group or image.finer)] = image.ends
         size = {hits: PER_RAY * sum(own.values()) for hits, own in rays.items()}
         total = sum(size.values())
         if total > self.memory:
@@ -501,7 +501,7 @@ class Renderer:
         self._images[key] = image
         while len(self._images) > self.remember * len(self.scene.lights):
             self._images.popitem(last=False)
-        self._make_room(image.hits, image.finer.size)
+        self._make_room(image.hits, image.ends)
         if image.radiance is not None:
             self._keep_plain(key, image.radiance)
         return image

@@ -45,7 +45,8 @@ class Traced:
         from scipy.ndimage import binary_dilation, distance_transform_edt
 
         traced = binary_dilation(wanted, np.ones((3, 3), bool))
-        traced[LATTICE // 2 :: LATTICE, LATTICE // 2 :: LATTICE] = True
+        first = (min(LATTICE // 2, n - 1) for n in traced.shape)
+        traced[tuple(slice(k, None, LATTICE) for k in first)] = True
         self.index = np.flatnonzero(traced)
         place = np.zeros(traced.shape, np.int32)
         place[traced] = np.arange(len(self.index))
@@ -156,6 +157,11 @@ class LedImage:
         self.share: np.ndarray | float = 1.0  # (n, 1) of the finer samples in each of those pixels
         self.raw: tuple | None = None  # what the light makes before layers: at centres, at finer samples
         self.radiance: np.ndarray | None = None  # the image, in scenes without layers
+
+    @property
+    def ends(self) -> int:
+        """Ends of camera rays that its finer samples keep; those of a group are all of it."""
+        return self.finer.size if self.group is None else self.group.ends
 
     @property
     def visible(self):

@@ -147,6 +147,7 @@ class Group:
     lights       the LEDs;   sample   ends of the camera's rays at the pixels' centres, of which there are `pixels`
     visible      what each LED reaches of these, LED by LED, as `Renderer._visible` has it; None before
     finer        the finer samples of all LEDs, LED by LED; None where none takes any
+    ends         how many there are of these without those that LEDs share
     rim_visible  what each LED reaches of its own
     """
 
@@ -157,7 +158,7 @@ class Group:
         self.lights, self.sample, self.pixels = tuple(lights), sample, pixels
         self.names = [light.name for light in lights]
         self.visible = self.rim_visible = self._ends = None
-        self.sizes = [0] * len(self.names)
+        self.sizes, self.ends = [0] * len(self.names), 0
         lanes = dr.arange(mi.UInt32, len(self.names) * pixels)
         self._pixel, self._light, self._fine_light, self._end = lanes % pixels, lanes // pixels, None, None
 
@@ -188,7 +189,7 @@ class Group:
             np.repeat(starts[own] + count - np.cumsum(count), count) + np.arange(count.sum())
             for own, count in zip(places, counts)
         ]
-        self.sizes, self._ends = [len(own) for own in ends], finer.sample
+        self.sizes, self._ends, self.ends = [len(own) for own in ends], finer.sample, finer.size
         self._end = mi.UInt32(aligned(np.concatenate(ends), np.uint32))
         self._fine_light = mi.UInt32(aligned(np.repeat(np.arange(len(places)), self.sizes), np.uint32))
         return [

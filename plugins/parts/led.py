@@ -240,6 +240,8 @@ def build():
             at = tuple(self.number(n) for n in "xyz")
             if self.board is None:
                 return at
+            if not hasattr(self.board, "stands"):  # of a board of one's own
+                return tuple(float(c[0]) for c in self.position())
             return self.board.stands(at, self.number("turn") if "turn" in self.numbers else 0.0)
 
         def axis(self):

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from optics.light.samples import Traced
 from optics.scene.parameter import Variable
 
 BLUR = 0.4  # px
@@ -50,3 +51,15 @@ def test_values_that_are_used_stay(bench, blur, second):
         assert left < (5e-3 if blur else 1e-5 if key == "gel.press_x" else 1e-6), key
     assert np.array_equal(again, whole)  # outside of the context, all is as before
     assert np.abs(sparing - whole)[far].max() > 1e-4 * scale  # and within it something was left out
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (40, 1), (2, 40), (7, 9)])
+def test_some_pixel_is_followed_of_every_image(shape):
+    """Also where none is wanted; each pixel has one that stands for it, and those that are followed stand for
+    themselves."""
+    wanted = np.zeros(shape, bool)
+    traced = Traced(wanted)
+    assert len(traced.index) and traced.nearest.shape == (wanted.size,)
+    assert np.array_equal(traced.nearest[traced.index], np.arange(len(traced.index)))
+    wanted[0, 0] = True
+    assert 0 in Traced(wanted).index

@@ -104,7 +104,7 @@ def scene_with(tmp_path: Path, led: str) -> Path:
     return file
 
 
-def test_places_in_numbers_are_those_of_the_scene(mitsuba, tmp_path):
+def test_places_in_numbers_are_those_of_the_scene(mitsuba, tmp_path, monkeypatch):
     """Moved, turned about all axes and scaled, an LED from a pick-and-place file among others."""
     (tmp_path / "board.csv").write_text(KICAD)
     led = """<emitter type="led" id="led_1"><string name="board" value="ring"/>
@@ -115,7 +115,10 @@ def test_places_in_numbers_are_those_of_the_scene(mitsuba, tmp_path):
     )
     scene.set({"ring.x": 1.0, "ring.rx": 20.0, "ring.ry": -10.0, "ring.rz": 5.0, "ring.scale": 1.2})
     for name, place in scene.places_of(scene.values()).items():
-        assert scene.leds[name].stands() == pytest.approx(place, abs=1e-4)
+        assert scene.leds[name].stands() == pytest.approx(place, abs=1e-9)
+        assert np.array(scene.leds[name].position()).ravel() == pytest.approx(place, abs=1e-4)  # what is rendered
+    monkeypatch.delattr(type(scene.boards["ring"]), "stands")  # a board of one's own may have none
+    assert scene.leds["led_1"].stands() == pytest.approx(scene.places_of(scene.values())["led_1"], abs=1e-4)
     side, up, ahead = (np.array(v, float).ravel() for v in scene.leds["led_3"].frame)
     assert np.cross(side, up) == pytest.approx(ahead, abs=1e-5)
 

@@ -391,6 +391,36 @@ def test_bands_that_no_frame_shows_are_found_in_all_frames_together(name, frames
     assert found[0] <= np.mean([p() < 0.01 for _ in range(300)]) <= found[1], name
 
 
+@pytest.mark.parametrize("whole, dark", [(4, 12), (3, 0)])
+def test_frames_that_show_few_lines_raise_no_alarm_of_bands(whole, dark):
+    """12 frames, of which some use all pixels, others 12 x 12 of them, or none. Nominal to 3 sd of 300."""
+    rng = np.random.default_rng(22)
+    masks = [np.ones((48, 64, 1), bool)] * whole + [np.zeros((48, 64, 1), bool)] * (12 - whole)
+    masks[whole:] = [m.copy() for m in masks[whole:]]
+    spectrum = st.Spectrum(0)
+    for use in masks:
+        use[10 : 10 + dark, 10 : 10 + dark] = True
+        spectrum.add(use, [], np.zeros((*use.shape, 0)), 30.0 * use)
+    p = [spectrum._bands([rng.standard_normal(use.shape) * use for use in masks]) for _ in range(300)]
+    assert np.mean(np.array(p) < 0.01) < 0.03
+
+
+@pytest.mark.parametrize("light", [(100.0, *[10.0] * 11), (30.0,) * 12])
+def test_lines_that_are_noisy_raise_no_alarm_of_bands(light):
+    """A gain of each line that differs by .3 % from frame to frame: of one bright frame and eleven dark ones, and of
+    twelve alike."""
+    rng = np.random.default_rng(23)
+    use, spectrum = np.ones((48, 64, 1), bool), st.Spectrum(0)
+    for g in light:
+        spectrum.add(use, [], np.zeros((*use.shape, 0)), g * use)
+
+    def p():
+        gains = 0.003 * rng.standard_normal((12, 48, 1, 1))
+        return spectrum._bands([rng.standard_normal(use.shape) + g * own for g, own in zip(light, gains)])
+
+    assert np.mean([p() < 0.01 for _ in range(300)]) < 0.05  # the variance of few cycles is known to a fifth
+
+
 def sweeps(rng, count=126, parts=6):
     """Readings in turn in `parts` sweeps: a power and an offset are calibrated; an angle, a lamp of two powers, and
     time were swept."""
