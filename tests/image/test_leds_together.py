@@ -203,11 +203,11 @@ def test_another_press_needs_no_other_kernel(mitsuba):
                 for key in asked:
                     renderer.led_tangent(state, key.split(".")[0], key)
 
-    for x in (0.0, 0.2, 0.4, 0.6):
+    for x in (0.0, 0.2):
         press(x)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
-        for x in (0.7, 0.8, 0.9):
+        for x in (0.7, 0.9):
             press(x)
         made = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
     assert len(made) > 30 and all(k["cache_hit"] for k in made)
