@@ -361,10 +361,9 @@ class SceneModel:
 
     @contextmanager
     def where_used(self) -> Iterator[None]:
-        """Within it, predictions follow the camera's rays, take finer samples, and all directions of second
-        reflections, only at pixels that a frame of the same press uses, and beside them, and the rest from few: of a
-        mask that leaves a part of the image, a fit need not know the rest well. What a lens brings from there, such as
-        veiling glare, is known as well as these few tell it: to .3 % of a glare."""
+        """Within it, predictions are exact only at pixels that a frame of the same press uses, and beside them. Few
+        camera rays and few directions of second reflections serve the rest, and no finer samples. A lens brings light
+        from there too: beside a dent of `gelsight` this changed the derivative of veiling glare by 0.3 %."""
         before, self.sparing = self.sparing, True
         try:
             yield

@@ -99,16 +99,16 @@ class Developer:
         """x, y and the tangent of the field angle of each pixel, and the focal length; the latest are kept, as all
         frames have one lens."""
         key = tuple(own.values())
-        kept = not any(np.ndim(value) for value in key)
-        if not kept or key not in self._lens_kept:
-            x, y, focal = self.camera.normalised(SimpleNamespace(**own), self.u, self.v)
-            found = x, y, np.hypot(x, y), focal
-            if not kept:
-                return found
+        swept = any(np.ndim(value) for value in key)
+        if not swept and key in self._lens_kept:
+            return self._lens_kept[key]
+        x, y, focal = self.camera.normalised(SimpleNamespace(**own), self.u, self.v)
+        found = x, y, np.hypot(x, y), focal
+        if not swept:
             for image in map(np.asarray, found):
                 image.flags.writeable = False
             self._lens_kept = {key: found} if len(self._lens_kept) >= LENSES else {**self._lens_kept, key: found}
-        return self._lens_kept[key]
+        return found
 
     def view(self, values: Mapping[str, complex]) -> SimpleNamespace:
         """What an image function sees as `camera`: every parameter of the camera, and the geometry of its pixels.

@@ -561,11 +561,12 @@ class Renderer:
             return self._render_crowded(hits, led, seed)
         part = self.scene.leds[led]
         visible = self._unshaded(hits, part)
-        rim = self._joint_rim(hits) if self.layered else self._rim(hits, self._seen(hits, visible))
+        seen = self._seen(hits, visible)
+        rim = self._joint_rim(hits) if self.layered else self._rim(hits, seen)
         index, bent, share = self._sampled(hits, part, rim)
         finer = self._finer(hits, index, bent)
         rim_visible = self._visible(finer.sample.si, part) if len(index) else None
-        image = LedImage(led, hits, rim, index, finer, visible, rim_visible, self._seen(hits, visible).mean(0) > 0.5)
+        image = LedImage(led, hits, rim, index, finer, visible, rim_visible, seen.mean(0) > 0.5)
         image.share = share
         image.raw = self._direct(image)
         if not self.layered:
@@ -597,7 +598,7 @@ class Renderer:
         few = [np.isin(np.arange(len(index)), bent) for index, bent in zip(indices, few)]
         if sum(np.where(own, self.bent_side**2, self.rim_samples).sum() for own in few) > MOST_FINER:
             return {}
-        # most pixels take the same for all LEDs: one that takes few is another than one that takes many
+        # LEDs share a pixel's samples, unless one takes few there and another many
         own, places = np.unique(2 * np.concatenate(indices) + np.concatenate(few), return_inverse=True)
         places = np.split(places, np.cumsum(list(map(len, indices)))[:-1])
         finer = group.split(self._in_pixels(own // 2, own % 2 == 1), places)

@@ -47,7 +47,7 @@ def test_values_that_are_used_stay(bench, blur, second):
         left = np.abs(own[key] - slopes[key])[mask].max() / np.abs(slopes[key]).max()
         # a blur far below a pixel rings: of the slope three pixels beside it brings 2 V/9 of V = .16 px^2, a few per
         # cent, of which finer samples change a part
-        # that of the press is a difference of two images in single precision, a thousandth of them
+        # the slope of the press is a difference of two images that hardly differ: it shows their single precision
         assert left < (5e-3 if blur else 1e-5 if key == "gel.press_x" else 1e-6), key
     assert np.array_equal(again, whole)  # outside of the context, all is as before
     assert np.abs(sparing - whole)[far].max() > 1e-4 * scale  # and within it something was left out
