@@ -146,8 +146,9 @@ def findings_of(
 
 def _is_detail(own: Findings) -> bool:
     """Whether the best explanation leaves less than DETAIL of the excess, by HIDDEN standard deviations of the share,
-    each 1/excess_sd."""
-    return own.weighed and 1 - own.share + HIDDEN / own.excess_sd < DETAIL
+    each 1/excess_sd. One that explains more than all of it shows that the noise is overstated, and the excess of the
+    base too small to count in."""
+    return own.weighed and abs(1 - own.share) + HIDDEN / own.excess_sd < DETAIL
 
 
 def law_lead(case: Case, outcome: Outcome, score: float) -> float:

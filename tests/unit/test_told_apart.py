@@ -90,6 +90,22 @@ def test_plausibility_alone_must_lead_by_more(monkeypatch, fit, cost, needed):
     assert explanations._without(None, outcome, subject) == (pair, lead, needed)
 
 
+@pytest.mark.parametrize("strength, needed", [(0.84, 20.3), (0.02, 9.0)])
+def test_a_strength_far_from_plausible_is_claimed_over_nothing_for_what_it_costs(monkeypatch, strength, needed):
+    """A glare of 42 plausible sizes, whose fall of 13 chance brings once in 300 sets: beside no effect as well, it must
+    explain more than 3 ln(1 + 42^2/2)."""
+    variable = SimpleNamespace(keys=("glare",), frames=None)
+    effect = SimpleNamespace(name="glare", scope="scene")
+    glare = SimpleNamespace(effect=effect, variables=[variable], start=np.zeros(1), plausible=np.array([0.02]))
+    fit = SimpleNamespace(values=None)
+    best = SimpleNamespace(keys={("glare", None)}, members=[glare], fit=fit, deviance=87.0, cost=24.8, gain=0.0)
+    base = SimpleNamespace(keys=set(), members=[], names=frozenset(), deviance=100.0, cost=0.0, gain=0.0)
+    monkeypatch.setattr(explanations, "_lead", lambda *a: (13.0, 9.0))
+    monkeypatch.setattr(explanations, "value_of", lambda *a: strength)
+    outcome, case = SimpleNamespace(best=best, trials=[best, base]), SimpleNamespace(model=None)
+    assert explanations._without(case, outcome, glare)[2] == pytest.approx(needed, abs=0.05)
+
+
 @pytest.mark.parametrize(
     "deviance, lead, larger",
     [
@@ -594,11 +610,13 @@ def test_effects_that_predict_the_same_are_not_told_apart_whatever_their_slopes_
 
 
 @pytest.mark.parametrize(
-    "share, excess_sd, detail", [(1.0002, 792.0, True), (0.995, 500.0, True), (1.2, 5.2, False), (0.98, 2400.0, False)]
+    "share, excess_sd, detail",
+    [(1.0002, 792.0, True), (0.995, 500.0, True), (1.2, 5.2, False), (0.98, 2400.0, False), (1.47, 6.8, False)],
 )
 def test_what_is_surely_a_hundredth_of_the_excess_is_a_detail(share, excess_sd, detail):
     """Light past the films, partly polarized, of which plain stray light leaves .0 +- .1 % of an excess of 792 sd: no
-    curve is a rival. Of an excess of 5 sd, what is left is not known to a fifth."""
+    curve is a rival. Of an excess of 5 sd, what is left is not known to a fifth; and where effects explain half as much
+    again, the noise is overstated."""
     own = SimpleNamespace(share=share, excess_sd=excess_sd, weighed=True)
     assert findings._is_detail(own) is detail
     assert not findings._is_detail(SimpleNamespace(share=math.nan, excess_sd=792.0, weighed=True))
