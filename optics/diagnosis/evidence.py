@@ -245,7 +245,8 @@ class Evidence:
         base: Sequence[int],
         apart: Callable[[np.ndarray], np.ndarray] | None = None,
     ) -> st.Structure:
-        """Test of low-frequency structure in residual images, after a calibration of the columns `base`.
+        """Test of structure in residual images, after a calibration of the columns `base`: low frequencies, and what the
+        spectrum looks for besides.
 
         apart   of readings, what whitens columns (n, k) by the noise that they share; None: by that of settings"""
         if apart is not None and isinstance(self.spectrum, st.Sweeps):

@@ -1,6 +1,7 @@
 """What a diagnosis is: one of six verdict words, the table of effects and everything that the verdict rests on.
 
-    NOTHING      no effect stands out among all that were tested, and no low-frequency structure is left
+    NOTHING      no effect stands out among all that were tested, and no structure is left: no low
+                 frequencies, no single strong one, and no bands
     CLAIM        one effect is part of every explanation (set of effects) that a refit of everything does not rule out;
                  no curve along a coordinate does better; its strength is homogeneous; held-out frames improve
     AMBIGUOUS    several explanations are not told apart and no effect is part of all: the set, and what would decide
@@ -54,7 +55,7 @@ class Refit:
 
     fall, predicted  of chi2, with the weights of the base model; ratio: fall / predicted
     strength, sd     per variable, in its unit; sd from noise and `clutter`; at_bound: variables that ended at a bound
-    excess_sd, structure_p   what is left with it: excess misfit, and p of low-frequency structure
+    excess_sd, structure_p   what is left with it: excess misfit, and p of structure
     clear            of the strengths from their start, in standard deviations of all of them together
     chance           family-wise p of the strength by its scatter between parts of the sensor or session; NaN: not
                      computed, or too few parts
@@ -456,7 +457,7 @@ class Basis:
     rank       of the base's derivative images: dof = values - rank
     phi        chi2 / dof; excess_sd: (chi2 - dof) / sqrt(2 dof); frame_phi: chi2 per value of each frame
     gradient   |Q'r|^2 per parameter: below 1 the base is calibrated
-    structure_*  F and p of the low-frequency structure; high_frequency: 1 where the noise model is right
+    structure_*  F and p of the structure; high_frequency: 1 where the noise model is right
     render_noise variance of the prediction's Monte Carlo noise over that of the measurement, added to it
     """
 

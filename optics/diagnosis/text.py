@@ -195,7 +195,7 @@ def _nothing(f: Findings, tested: int) -> str:
         if is_structured(f.structure_p, f.excess_sd) or f.weighed
         else f"no excess misfit is left ({f.excess_sd:.2g} sd)"
         if math.isnan(f.structure_p)
-        else f"no low-frequency structure is left (p {p_text(f.structure_p)})"
+        else f"no structure is left (p {p_text(f.structure_p)})"
     )
     return f"none of {tested} effects is significant ({how}) and {tail}. The upper limits say what may still be there."
 

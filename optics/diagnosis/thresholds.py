@@ -51,7 +51,7 @@ MIMICS = (*MAPS, "frame")  # coordinates whose curves can mimic others: 'frame' 
 
 
 def is_structured(structure_p: float, excess_sd: float) -> bool:
-    """Whether misfit is left: low-frequency structure; an excess, where images are too small to show it (p is NaN)."""
+    """Whether misfit is left: structure; an excess, where images are too small to show it (p is NaN)."""
     return excess_sd > EXCESS if math.isnan(structure_p) else structure_p < LEVEL
 
 

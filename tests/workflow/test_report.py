@@ -288,7 +288,7 @@ def demo_diagnosis(rows, found, index, names) -> dict:
         "rows": table,
         "not_tested": {"retardance": "no polarizer in the scene"},
         "warnings": [],
-        "sentence": f"none of {len(table)} effects is significant (family-wise p 0.8) and no low-frequency structure "
+        "sentence": f"none of {len(table)} effects is significant (family-wise p 0.8) and no structure "
         "is left (p 0.31).",
         "conditions": [
             {"name": "an effect stands out", "holds": claim, "text": "family-wise p <1e-9 against 0.01"},
