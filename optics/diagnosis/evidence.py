@@ -245,8 +245,8 @@ class Evidence:
         base: Sequence[int],
         apart: Callable[[np.ndarray], np.ndarray] | None = None,
     ) -> st.Structure:
-        """Test of structure in residual images, after a calibration of the columns `base`: low frequencies, and what the
-        spectrum looks for besides.
+        """Test of structure in residual images, after a calibration of the columns `base`: of low frequencies, and of
+        what the spectrum looks for besides.
 
         apart   of readings, what whitens columns (n, k) by the noise that they share; None: by that of settings"""
         if apart is not None and isinstance(self.spectrum, st.Sweeps):
