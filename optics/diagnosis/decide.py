@@ -49,6 +49,7 @@ class Findings:
     lead         of the best explanation's score over that of the best one without the winner; needed: TOLD, or more
                  where misfit is left
     against      that explanation, in words
+    detail_of    effects that explain nearly all without the winner, and are not part of every explanation, in words
     ratio        the best curve's fall, less its cost, over that of the best explanation; coordinate: of that curve
     rival        whether a curve does significantly better, by RIVAL (a map) or RIVAL_CURVE, where misfit is left, or is
                  not told apart from several effects; curve_lead: of its score over that of the best explanation,
@@ -121,6 +122,7 @@ class Findings:
     law: str = ""
     law_lead: float = math.inf
     fragile: str = ""
+    detail_of: str = ""
     untried: Sequence[str] = ()
     measured: bool = False
     misstated: bool = False
@@ -252,8 +254,9 @@ def _against_effects(f: Findings) -> list[Condition]:
             "lead",
             f.lead,
             f.needed,
-            f.common and f.lead > f.needed and not f.shared,
+            f.common and f.lead > f.needed and not f.shared and not f.detail_of,
             f"{f.lead:.3g} ahead of {f.against or 'no effect'}, {f.needed:.3g} needed"
+            + (f"; but a detail beside {f.detail_of}, which is not decided" if f.detail_of else "")
             if f.common
             else f"the data do not decide between {f.survivors} explanations, and no effect is part of all",
         ),

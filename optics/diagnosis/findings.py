@@ -19,7 +19,7 @@ from optics.diagnosis.evidence import Candidate, Evidence, at_bound
 from optics.diagnosis.explanations import Outcome, beside_noise, fall_over_noise, lead_without
 from optics.diagnosis.refit import Case, clear
 from optics.diagnosis.result import Basis, Fingerprint, Law, Level, Split
-from optics.diagnosis.thresholds import AS_GOOD, DETAIL, HIDDEN, LEVEL, MISSTATED, SURE, TOLD, UNEVEN
+from optics.diagnosis.thresholds import AS_GOOD, DETAIL, HIDDEN, LEVEL, MAIN, MISSTATED, SURE, TOLD, UNEVEN
 from optics.fit.compare import led_label
 from optics.fit.model import Model, value_of
 from optics.fit.result import Fit
@@ -200,6 +200,7 @@ def _of_subject(
         lead=lead,
         needed=needed,
         against=against,
+        detail_of=_detail_of(outcome, name),
         share=(best.fall - best.expectation) / excess if excess > 0 else math.nan,
         excess_sd=basis.excess_sd,
         left=basis.misfit * math.sqrt(max(1 - best.fall / basis.chi2, 0.0)),
@@ -223,6 +224,15 @@ def _of_subject(
         fragile=table.fragile(name, outcome.named),
         untried=[" with ".join(sorted(names)) for names in outcome.untried if name not in names],
     )
+
+
+def _detail_of(outcome: Outcome, name: str) -> str:
+    """What explains nearly all without an effect that every survivor has, and is not decided; '' where nothing does."""
+    if name not in outcome.core or len(outcome.survivors) < 2:
+        return ""
+    rest = outcome.without(outcome.best, name)
+    undecided = sorted(rest.names - set(outcome.core))
+    return " with ".join(undecided) if undecided and rest.fall > MAIN * outcome.best.fall else ""
 
 
 def _far(subject: Candidate, strength: Sequence[float]) -> float:

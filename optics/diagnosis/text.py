@@ -273,6 +273,11 @@ def _ambiguous(f: Findings, explanations: Sequence[Explanation]) -> str:
         other += f" By its score {f.untried[0]} may explain more, and was not calibrated."
     if f.weighed and f.share < MOST:
         other += f" The best explains {share_text(f.share)} of the excess misfit; the rest has another cause."
+    if f.detail_of:
+        other += (
+            f" Each has {f.winner}, which may be a detail of what is not decided: {f.detail_of} explains nearly all "
+            "without it."
+        )
     if f.shared:
         return (
             "the data do not decide between noise that neighbours in the session share, such as a lamp whose power "

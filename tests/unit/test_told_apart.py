@@ -666,3 +666,22 @@ def test_a_refit_that_ended_where_the_base_is_survives_nothing(monkeypatch, chan
     monkeypatch.setattr(explanations.Outcome, "core", [])
     outcome = explanations.Outcome(best, best, [best], [best, other, base], 1.0, None)
     assert explanations._survived(case, outcome).survivors == ([best, other] if survives else [best])
+
+
+@pytest.mark.parametrize(
+    "rest, survivors, core, found",
+    [
+        (3397.0, 2, ["eccentric"], "scale"),
+        (3397.0, 1, ["eccentric", "scale"], ""),  # the scale is decided
+        (3397.0, 2, ["scale"], ""),  # and is what is asked for
+        (2810.0, 2, ["eccentric"], ""),  # no detail: a fifth of the fall
+    ],
+)
+def test_a_detail_of_what_is_not_decided_is_no_claim(rest, survivors, core, found):
+    """A dial whose scale is bent: a wrong scale, or a misalignment, with an eccentric dial explain 3579 of chi2, and
+    the wrong scale alone 95 % of it."""
+    inner = SimpleNamespace(names=frozenset({"scale"}), fall=rest)
+    outcome = SimpleNamespace(
+        best=SimpleNamespace(fall=3579.0), survivors=[None] * survivors, core=core, without=lambda trial, name: inner
+    )
+    assert findings._detail_of(outcome, "eccentric") == found
