@@ -171,11 +171,20 @@ def sentence(
     if word == "CANNOT_TELL":
         last = [c for c in failing if c.name == CURVE]  # says more than all others together
         reasons = "; ".join(f"{c.name}: {c.text}" for c in last or failing) or "; ".join(c.text for c in conditions)
-        return f"misfit is left, but no verdict holds ({reasons})."
+        return f"misfit is left, but no verdict holds ({reasons}).{_so_far(f, explanations)}"
     winner = next(row for row in rows if row.name == f.winner)
     if word == "CLAIM":
         return _claim(f, winner, rows, explanations, levels, shifts, basis)
     return _partial(f, winner, failing)
+
+
+def _so_far(f: Findings, explanations: Sequence[Explanation]) -> str:
+    """What explains most where no verdict holds, in a sentence; '' where nothing is told apart from no effect."""
+    best = next((e for e in explanations if e.survives and e.effects), None)
+    if not f.winner or best is None:
+        return ""
+    share = f", which explains {share_text(f.share)} of the excess misfit" if f.weighed else ""
+    return f" The best explanation so far is {best.name}{share}."
 
 
 def _nothing(f: Findings, tested: int) -> str:

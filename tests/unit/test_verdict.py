@@ -333,6 +333,7 @@ def test_clutter_alone_is_not_an_effect():
 def test_without_held_out_frames_there_is_no_claim():
     d = judge(*calibrated({"crosstalk": 0.03}), library("crosstalk", "glare"), held=())
     assert d.word == "CANNOT_TELL" and "held out" in d.sentence and any("hold out" in h for h in d.hints)
+    assert f"The best explanation so far is {d.explanations[0].name}, which explains" in d.sentence
 
 
 # -- only a claim names a cause --------------------------------------------------------------------------------------
