@@ -185,7 +185,7 @@ class Others:
 
 def _squares(places: Sequence[dict]) -> list[Parts]:
     """Squares of the sensor that all frames share; the same of each frame."""
-    rows, columns = (1 + max(float(p[name].max()) for p in places) for name in ("row", "column"))
+    rows, columns = (1 + max(float(p[name].max(initial=0.0)) for p in places) for name in ("row", "column"))
     shared = [(p["row"] * REACH // rows * REACH + p["column"] * REACH // columns).astype(int) for p in places]
     apart = [index + n * REACH**2 for n, index in enumerate(shared)]
     return [Parts(shared, REACH**2), Parts(apart, REACH**2 * len(places))]

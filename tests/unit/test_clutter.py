@@ -200,6 +200,17 @@ def test_what_one_image_says_of_itself_counts_where_others_say_nothing():
     assert Others(np.split(sets.images, FRAMES), left, readings).join(blocks, found) == found
 
 
+def test_a_frame_that_uses_no_pixel_says_nothing():
+    """A dark photograph, of which all is below what its noise tells."""
+    sets = Sets(3)
+    images = np.split(sets.images, FRAMES)
+    left = np.split(sets.rng.standard_normal(len(sets.images)), FRAMES)
+    expected = Others(images, left, sets.places).learnt
+    empty = {name: values[:0] for name, values in sets.places[0].items()}
+    found = Others([*images, images[0][:0]], [*left, left[0][:0]], [*sets.places, empty]).learnt
+    assert [f.level for f in found] == pytest.approx([e.level for e in expected], rel=1e-12)
+
+
 def test_noise_alone_is_learnt_as_noise():
     """phi is 1, with nearly as many degrees of freedom as directions, but for chance: an image that is alike all over
     gets less than half of it on top, in each of eight sets of effects (.32 is the most of these)."""
