@@ -229,9 +229,12 @@ class _Problem:
         return values
 
     def moved(self, points: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """Points after a step (3 N,) in units of the half widths along the axes of each line of sight."""
+        """Points after a step (3 N,) in units of the half widths along the axes of each line of sight. A body stays in
+        the skin: at most it touches the face from below."""
         step = np.clip(x.reshape(-1, 3), -LARGEST, LARGEST)
-        return points + np.einsum("nkc,nk->nc", self.axes, step)
+        there = points + np.einsum("nkc,nk->nc", self.axes, step)
+        there[:, 2] = np.minimum(there[:, 2], -self.part.balls()[1])
+        return there
 
     def total(self, points: np.ndarray, values: Values, state: State) -> float:
         chi2 = sum(float((r**2 * s**2).sum()) for r, s in zip(state[1], self.scales))

@@ -109,6 +109,15 @@ def test_a_bead_is_in_doubt_by_noise_and_by_the_others():
     assert in_doubt(np.zeros(0)).tolist() == []
 
 
+def test_a_step_leaves_no_bead_outside_the_skin():
+    """Two beads of 0.6 mm, a step of 0.2 mm up: one would stick out of the face, under which the skin's motion ends."""
+    problem = object.__new__(_Problem)
+    problem.axes = np.tile(np.eye(3), (2, 1, 1))
+    problem.part = SimpleNamespace(balls=lambda: (np.zeros((2, 3)), np.array([0.3, 0.3])))
+    found = problem.moved(np.array([[0.0, 0.0, -0.4], [1.0, 0.0, -2.0]]), np.array([0.1, 0.0, 0.2, 0.0, 0.1, 0.2]))
+    np.testing.assert_allclose(found, [[0.1, 0.0, -0.3], [1.0, 0.1, -1.8]])
+
+
 @pytest.fixture
 def fourteen(mitsuba):
     """Beads by the numpy maker, at rest and under one press: true values, true places, and a model of any table."""
