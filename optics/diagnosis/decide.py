@@ -33,6 +33,8 @@ DIALS = "dials known"  # of an effect with a strength per frame
 RIVALS = "rivals calibrated"  # of pairs of effects of images, which are dear
 LAW = "no other law"  # of an effect that the model has already
 CLUTTER = "beyond clutter"  # of the strength, which parts of the data tell
+NO_DETAIL = "no detail"  # of what is not decided
+PLAUSIBLE = "plausible"  # strengths for what the effect adds
 CURVE = "a curve explains it"  # name of the condition that a curve must meet for UNKNOWN
 
 
@@ -49,7 +51,10 @@ class Findings:
     lead         of the best explanation's score over that of the best one without the winner; needed: TOLD, or more
                  where misfit is left
     against      that explanation, in words
-    detail_of    effects that explain nearly all without the winner, and are not part of every explanation, in words
+    detail_of    effects of the best explanation that explain nearly all without the winner, and are not part of every
+                 explanation, in words; '' for none
+    adds         what the winner adds to the fall of the others, beside noise that neighbours share; priced: what its
+                 strengths cost for being far from neutral (`optics.diagnosis.explanations`)
     ratio        the best curve's fall, less its cost, over that of the best explanation; coordinate: of that curve
     rival        whether a curve does significantly better, by RIVAL (a map) or RIVAL_CURVE, where misfit is left, or is
                  not told apart from several effects; curve_lead: of its score over that of the best explanation,
@@ -123,6 +128,8 @@ class Findings:
     law_lead: float = math.inf
     fragile: str = ""
     detail_of: str = ""
+    adds: float = math.inf
+    priced: float = 0.0
     untried: Sequence[str] = ()
     measured: bool = False
     misstated: bool = False
@@ -205,7 +212,7 @@ def _word_of_winner(f: Findings, failed: set[str]) -> str:
     if not failed:
         return "CLAIM"
     refuted = {"held out"} if f.refuted else set()
-    if failed & {"significant", "strength", CLUTTER, *refuted} and not f.structured and not f.weighed:
+    if failed & {"significant", "strength", PLAUSIBLE, CLUTTER, *refuted} and not f.structured and not f.weighed:
         # The refit did not bring the fall that the score promised, or the base's own calibration brought it; or the
         # strength scatters as much between parts of the data; or frames that took no part do not know of it.
         return "NOTHING"
@@ -217,9 +224,10 @@ def _word_of_winner(f: Findings, failed: set[str]) -> str:
     alone = not failed & bars
     alone = alone and not f.another_law
     rivals = f.survivors > 1 or f.shared or LAW in failed or bool(f.fragile) or bool(f.unset) or bool(f.untried)
-    if failed & {"lead", LAW, "robust", DIALS, RIVALS} and alone and f.some_even and rivals:
+    if failed & {"lead", LAW, "robust", DIALS, RIVALS, NO_DETAIL} and alone and f.some_even and rivals:
         return "AMBIGUOUS"
-    return "PARTIAL" if failed - {"spread"} and failed <= {"share", "even", "spread"} else ""
+    some = failed - {"spread", NO_DETAIL}
+    return "PARTIAL" if some and some <= {"share", "even"} else ""
 
 
 def _is_anything_there(f: Findings, significant: bool) -> list[Condition]:
@@ -254,11 +262,19 @@ def _against_effects(f: Findings) -> list[Condition]:
             "lead",
             f.lead,
             f.needed,
-            f.common and f.lead > f.needed and not f.shared and not f.detail_of,
+            f.common and f.lead > f.needed and not f.shared,
             f"{f.lead:.3g} ahead of {f.against or 'no effect'}, {f.needed:.3g} needed"
-            + (f"; but a detail beside {f.detail_of}, which is not decided" if f.detail_of else "")
             if f.common
             else f"the data do not decide between {f.survivors} explanations, and no effect is part of all",
+        ),
+        Condition(
+            NO_DETAIL,
+            float(bool(f.detail_of)),
+            0.0,
+            not f.detail_of,
+            f"it may be a detail of {f.detail_of}, which explains nearly all without it and is not decided"
+            if f.detail_of
+            else "nothing that is not decided explains nearly all without it",
         ),
         Condition(
             "robust",
@@ -345,6 +361,13 @@ def _of_the_strength(f: Findings) -> list[Condition]:
             STRENGTH,
             not f.clear < STRENGTH,
             "its error is unknown" if math.isnan(f.clear) else f"{f.clear:.2g} sd from none, {STRENGTH:g} needed",
+        ),
+        Condition(
+            PLAUSIBLE,
+            f.adds,
+            f.priced,
+            not f.adds < f.priced,
+            f"it adds {f.adds:.3g} to the fall of chi2, and {f.far:.2g} plausible sizes cost {max(f.priced, 0.0):.3g}",
         ),
         Condition(
             "range",

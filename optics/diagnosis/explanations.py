@@ -16,8 +16,9 @@ where that is more; of readings, each explanation may have noise that neighbours
 Whether an explanation needs an effect that a simpler one lacks is a question of significance: family-wise; of images,
 with the design effect of what tells the two apart (`optics.diagnosis.homogeneity.variances`). Of two that are not
 nested, one is told apart from the best when its score is TOLD lower (CLEAR, where plausibility alone decides; an effect
-is claimed when every explanation without it is SURE lower, and NO_TIE where plausibility alone decides, and one that is
-within it by what its strengths' distance from neutral costs); of readings,
+is claimed when every explanation without it is SURE lower, and NO_TIE where plausibility alone decides, and when it
+adds more to the fall than its strengths' distance from neutral costs: chance brings a significant fall by strengths
+that nobody expects); of readings,
 what it predicts better of blocks of the session that were left out counts against that lead; and when, of images or of
 readings with MISSTATED noise, the difference of falls exceeds the smaller of HALF of what the best one leaves and
 MARGIN of its fall, as misfit that is left may lie along any direction; and of images, where misfit is left, noise that
@@ -1047,21 +1048,14 @@ def _without(case: Case, outcome: Outcome, subject: Candidate) -> tuple[Trial, f
         if not (rival.keys < best.keys and rival.gain - best.gain < TOLD):  # by significance, in white noise
             by_data = lead - (rival.cost - best.cost) > TOLD or not rival.members
             needed = max(needed, SURE if by_data else NO_TIE)
-        if rival.keys < best.keys:
-            needed = max(needed, _farness(case, best, rival))
         found.append((rival, lead, needed))
     return min(found, key=lambda t: t[1] - t[2])
 
 
-def _farness(case: Case, best: Trial, inner: Trial) -> float:
-    """What it costs that effects beside those of an inner explanation are far from neutral: what chance brings among so
-    many effects, at 42 plausible sizes, is no claim."""
-    values = best.fit.values
-    changes = [
-        (c, np.array([value_of(case.model, values, v) for v in c.variables]) - c.start)
-        for c in best.members
-        if c.effect.name not in inner.names
-    ]
+def farness(case: Case, trial: Trial) -> float:
+    """What it costs an explanation that its strengths are far from neutral: 3 ln(1 + x^2/2) of each effect."""
+    values = trial.fit.values
+    changes = [(c, np.array([value_of(case.model, values, v) for v in c.variables]) - c.start) for c in trial.members]
     return sum(implausible(c, change) - EACH for c, change in changes)
 
 

@@ -16,7 +16,7 @@ from optics.diagnosis.correlation import NOTICED, WANDER
 from optics.diagnosis.decide import Findings, Opponent, ordered, rivals
 from optics.diagnosis.dials import unstated
 from optics.diagnosis.evidence import Candidate, Evidence, at_bound
-from optics.diagnosis.explanations import Outcome, beside_noise, fall_over_noise, lead_without
+from optics.diagnosis.explanations import Outcome, beside_noise, fall_over_noise, farness, lead_without
 from optics.diagnosis.refit import Case, clear
 from optics.diagnosis.result import Basis, Fingerprint, Law, Level, Split
 from optics.diagnosis.thresholds import AS_GOOD, DETAIL, HIDDEN, LEVEL, MAIN, MISSTATED, SURE, TOLD, UNEVEN
@@ -146,9 +146,8 @@ def findings_of(
 
 def _is_detail(own: Findings) -> bool:
     """Whether the best explanation leaves less than DETAIL of the excess, by HIDDEN standard deviations of the share,
-    each 1/excess_sd. One that explains more than all of it shows that the noise is overstated, and the excess of the
-    base too small to count in."""
-    return own.weighed and abs(1 - own.share) + HIDDEN / own.excess_sd < DETAIL
+    each 1/excess_sd. To have explained more than all of it is no better."""
+    return own.weighed and max(1 - own.share, 0.0) + HIDDEN / own.excess_sd < DETAIL
 
 
 def law_lead(case: Case, outcome: Outcome, score: float) -> float:
@@ -188,6 +187,7 @@ def _of_subject(
     carried, carried_by = _carried(case, outcome, subject)
     strength = [value_of(case.model, best.fit.values, v) for v in subject.variables]
     fall, held_out = fall_over_noise(case, outcome, name), levels[-1].fall if len(levels) > 1 else math.nan
+    priced = farness(case, best) - farness(case, outcome.without(best, name))
     return Findings(
         table.p_best,
         basis.structure_p,
@@ -214,6 +214,8 @@ def _of_subject(
         ahead=-best.ahead,
         clear=clear(best.fit, subject, strength),
         far=_far(subject, strength),
+        adds=fall,
+        priced=priced,
         at_end=_at_end(subject, strength),
         complete=best.complete,
         ran=_ran(case, best.fit),
@@ -227,12 +229,15 @@ def _of_subject(
 
 
 def _detail_of(outcome: Outcome, name: str) -> str:
-    """What explains nearly all without an effect that every survivor has, and is not decided; '' where nothing does."""
-    if name not in outcome.core or len(outcome.survivors) < 2:
+    """Effects of the best explanation that not every survivor has, where they explain nearly all without those that
+    every survivor has, and more than these do; '' where they do not. Those that all have may then be a detail of the
+    law of the others."""
+    best, core = outcome.best, set(outcome.core)
+    undecided, decided = best.names - core, best.names & core
+    if name not in decided or not undecided:
         return ""
-    rest = outcome.without(outcome.best, name)
-    undecided = sorted(rest.names - set(outcome.core))
-    return " with ".join(undecided) if undecided and rest.fall > MAIN * outcome.best.fall else ""
+    rest, own = (max(t.fall for t in outcome.trials if t.names <= names) for names in (undecided, decided))
+    return " with ".join(sorted(undecided)) if rest > max(MAIN * best.fall, own) else ""
 
 
 def _far(subject: Candidate, strength: Sequence[float]) -> float:

@@ -1,13 +1,14 @@
 """What a diagnosis is: one of six verdict words, the table of effects and everything that the verdict rests on.
 
-    NOTHING      no effect stands out among all that were tested, and no structure is left: no low
-                 frequencies, no single strong one, and no bands
+    NOTHING      no effect stands out among all that were tested, or none that is plausible, and no structure is left:
+                 no low frequencies, no single strong one, and no bands
     CLAIM        one effect is part of every explanation (set of effects) that a refit of everything does not rule out;
                  no curve along a coordinate does better; its strength is homogeneous; held-out frames improve
-    AMBIGUOUS    several explanations are not told apart and no effect is part of all: the set, and what would decide
+    AMBIGUOUS    several explanations are not told apart, and no effect is part of all, or only one that may be a detail
+                 of the others: the set, and what would decide
     PARTIAL      an effect explains a part; the rest, or the inhomogeneity of its strength, has another cause
     UNKNOWN      a curve along a coordinate (radius, height, ...) explains more than any effect: the curve
-    CANNOT_TELL  none of these: which condition failed, and what would decide
+    CANNOT_TELL  none of these: which condition failed, the best explanation so far, and what would decide
 
 Only a CLAIM names a cause. Significance alone is no verdict: on a real sensor many small effects are significant. The
 rule is in `optics.diagnosis.decide`, its numbers in `optics.diagnosis.thresholds`, the wording in
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 WORDS = ("NOTHING", "CLAIM", "AMBIGUOUS", "PARTIAL", "UNKNOWN", "CANNOT_TELL")
-NAMED = ("CLAIM", "PARTIAL", "AMBIGUOUS")  # words that name effects
+NAMED = ("CLAIM", "PARTIAL", "AMBIGUOUS")  # words that answer by effects
 PLANS = ("together", "more of the same")  # families of advice that consist of several shots
 
 

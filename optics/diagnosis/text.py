@@ -171,29 +171,35 @@ def sentence(
     if word == "CANNOT_TELL":
         last = [c for c in failing if c.name == CURVE]  # says more than all others together
         reasons = "; ".join(f"{c.name}: {c.text}" for c in last or failing) or "; ".join(c.text for c in conditions)
-        return f"misfit is left, but no verdict holds ({reasons}).{_so_far(f, explanations)}"
+        return f"misfit is left, but no verdict holds ({reasons}).{_so_far(f, explanations, basis)}"
     winner = next(row for row in rows if row.name == f.winner)
     if word == "CLAIM":
         return _claim(f, winner, rows, explanations, levels, shifts, basis)
     return _partial(f, winner, failing)
 
 
-def _so_far(f: Findings, explanations: Sequence[Explanation]) -> str:
-    """What explains most where no verdict holds, in a sentence; '' where nothing is told apart from no effect."""
+def _so_far(f: Findings, explanations: Sequence[Explanation], basis: Basis) -> str:
+    """The explanation with the best score where no verdict holds, in a sentence; '' where nothing is told apart from no
+    effect."""
     best = next((e for e in explanations if e.survives and e.effects), None)
     if not f.winner or best is None:
         return ""
-    share = f", which explains {share_text(f.share)} of the excess misfit" if f.weighed else ""
+    excess = basis.chi2 - basis.dof
+    share = f", which explains {share_text(best.fall / excess)} of the excess misfit" if f.weighed else ""
     return f" The best explanation so far is {best.name}{share}."
 
 
 def _nothing(f: Findings, tested: int) -> str:
+    none = f"none of {tested} effects is significant"
     if not f.p_family < LEVEL:
         how = f"family-wise p {p_text(f.p_family)}"
     elif not f.p_winner < LEVEL:
         how = f"after refit, family-wise p {p_text(f.p_winner)}"
     elif f.refuted and not (f.clear < STRENGTH or f.chance >= LEVEL):
         how = f"the best, {f.winner}, raises chi2 of the held-out frames by {-f.held_out:.2g}"
+    elif f.adds < f.priced and f.clear >= STRENGTH:
+        none = f"of {tested} effects one is significant, but too far from plausible for what it explains"
+        how = f"{f.winner} lowers chi2 by {f.adds:.3g}; {f.far:.2g} times its plausible strength costs {f.priced:.3g}"
     elif not f.chance > LEVEL:
         how = f"after refit, the best, {f.winner}, has a strength of {f.clear:.2g} sd"
     else:
@@ -206,7 +212,7 @@ def _nothing(f: Findings, tested: int) -> str:
         if math.isnan(f.structure_p)
         else f"no structure is left (p {p_text(f.structure_p)})"
     )
-    return f"none of {tested} effects is significant ({how}) and {tail}. The upper limits say what may still be there."
+    return f"{none} ({how}) and {tail}. The upper limits say what may still be there."
 
 
 def _claim(
@@ -284,8 +290,8 @@ def _ambiguous(f: Findings, explanations: Sequence[Explanation]) -> str:
         other += f" The best explains {share_text(f.share)} of the excess misfit; the rest has another cause."
     if f.detail_of:
         other += (
-            f" Each has {f.winner}, which may be a detail of what is not decided: {f.detail_of} explains nearly all "
-            "without it."
+            f" Each of these explanations has {f.winner}. It may be a detail of what is not decided: {f.detail_of} "
+            "explains nearly all without it."
         )
     if f.shared:
         return (

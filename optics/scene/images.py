@@ -29,7 +29,7 @@ def bend(image: np.ndarray, rim: np.ndarray) -> np.ndarray:
     further in: so nothing jumps where a rim moves on by a pixel.
 
     A 24th of it is by how much the mean of a pixel exceeds the value at its middle, to second order."""
-    found, twice = np.zeros_like(image), 2 * image
+    found, twice = np.zeros(image.shape, image.dtype), 2 * image
     bands = image.shape[2]
     for axis in (0, 1):
         if image.shape[axis] < 3:
@@ -39,20 +39,22 @@ def bend(image: np.ndarray, rim: np.ndarray) -> np.ndarray:
         )
         unknown = np.ones(rim.shape, bool)  # as the borders are
         unknown[inner] = rim[before] | rim[inner] | rim[after]
-        second = np.empty_like(image)
+        second = np.empty(image.shape, image.dtype)
         np.add(image[before], image[after], out=second[inner])
         second[inner] -= twice[inner]
         at = np.flatnonzero(unknown)
         values = second.reshape(-1, bands)
         values[at] = 0
-        # what few pixels beside a rim or border take over from the next ones
-        place, step = (at // rim.shape[1], rim.shape[1]) if axis == 0 else (at % rim.shape[1], 1)
-        beside, count = np.zeros((len(at), bands), image.dtype), np.zeros(len(at), int)
-        for there, own in ((at - step, place > 0), (at + step, place < rim.shape[axis] - 1)):
-            beside[own] += values[there[own]]
-            count[own] += ~unknown.ravel()[there[own]]
         found += second
-        found.reshape(-1, bands)[at] += beside / np.maximum(count, 1)[:, None]
+        # pixels beside a rim or border take over from the next ones
+        known = np.append(~unknown.ravel(), False)
+        place, step = (at // rim.shape[1], rim.shape[1]) if axis == 0 else (at % rim.shape[1], 1)
+        sides = np.where(place > 0, at - step, -1), np.where(place < rim.shape[axis] - 1, at + step, -1)
+        count = known[sides[0]].astype(int) + known[sides[1]]
+        total = found.reshape(-1, bands)
+        for there in sides:
+            own = known[there]
+            total[at[own]] += values[there[own]] / count[own, None]
     return found
 
 

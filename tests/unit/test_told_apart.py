@@ -90,20 +90,14 @@ def test_plausibility_alone_must_lead_by_more(monkeypatch, fit, cost, needed):
     assert explanations._without(None, outcome, subject) == (pair, lead, needed)
 
 
-@pytest.mark.parametrize("strength, needed", [(0.84, 20.3), (0.02, 9.0)])
-def test_a_strength_far_from_plausible_is_claimed_over_nothing_for_what_it_costs(monkeypatch, strength, needed):
-    """A glare of 42 plausible sizes, whose fall of 13 chance brings once in 300 sets: beside no effect as well, it must
-    explain more than 3 ln(1 + 42^2/2)."""
-    variable = SimpleNamespace(keys=("glare",), frames=None)
+@pytest.mark.parametrize("strength, cost", [(0.84, 20.3), (0.02, 1.2)])
+def test_what_it_costs_to_be_far_from_plausible(monkeypatch, strength, cost):
+    """A glare of 42 plausible sizes, 3 ln(1 + 42^2/2), or of one."""
     effect = SimpleNamespace(name="glare", scope="scene")
-    glare = SimpleNamespace(effect=effect, variables=[variable], start=np.zeros(1), plausible=np.array([0.02]))
-    fit = SimpleNamespace(values=None)
-    best = SimpleNamespace(keys={("glare", None)}, members=[glare], fit=fit, deviance=87.0, cost=24.8, gain=0.0)
-    base = SimpleNamespace(keys=set(), members=[], names=frozenset(), deviance=100.0, cost=0.0, gain=0.0)
-    monkeypatch.setattr(explanations, "_lead", lambda *a: (13.0, 9.0))
+    glare = SimpleNamespace(effect=effect, variables=["glare"], start=np.zeros(1), plausible=np.array([0.02]))
+    trial = SimpleNamespace(members=[glare], fit=SimpleNamespace(values=None))
     monkeypatch.setattr(explanations, "value_of", lambda *a: strength)
-    outcome, case = SimpleNamespace(best=best, trials=[best, base]), SimpleNamespace(model=None)
-    assert explanations._without(case, outcome, glare)[2] == pytest.approx(needed, abs=0.05)
+    assert explanations.farness(SimpleNamespace(model=None), trial) == pytest.approx(cost, abs=0.05)
 
 
 @pytest.mark.parametrize(
@@ -611,12 +605,19 @@ def test_effects_that_predict_the_same_are_not_told_apart_whatever_their_slopes_
 
 @pytest.mark.parametrize(
     "share, excess_sd, detail",
-    [(1.0002, 792.0, True), (0.995, 500.0, True), (1.2, 5.2, False), (0.98, 2400.0, False), (1.47, 6.8, False)],
+    [
+        (1.0002, 792.0, True),
+        (0.995, 500.0, True),
+        (1.2, 5.2, False),
+        (0.98, 2400.0, False),
+        (1.47, 6.8, False),
+        (1.02, 2400.0, True),
+    ],
 )
 def test_what_is_surely_a_hundredth_of_the_excess_is_a_detail(share, excess_sd, detail):
     """Light past the films, partly polarized, of which plain stray light leaves .0 +- .1 % of an excess of 792 sd: no
     curve is a rival. Of an excess of 5 sd, what is left is not known to a fifth; and where effects explain half as much
-    again, the noise is overstated."""
+    again, that is no better."""
     own = SimpleNamespace(share=share, excess_sd=excess_sd, weighed=True)
     assert findings._is_detail(own) is detail
     assert not findings._is_detail(SimpleNamespace(share=math.nan, excess_sd=792.0, weighed=True))
@@ -669,19 +670,18 @@ def test_a_refit_that_ended_where_the_base_is_survives_nothing(monkeypatch, chan
 
 
 @pytest.mark.parametrize(
-    "rest, survivors, core, found",
+    "falls, core, found",
     [
-        (3397.0, 2, ["eccentric"], "scale"),
-        (3397.0, 1, ["eccentric", "scale"], ""),  # the scale is decided
-        (3397.0, 2, ["scale"], ""),  # and is what is asked for
-        (2810.0, 2, ["eccentric"], ""),  # no detail: a fifth of the fall
+        ({"ab": 3579.0, "a": 3397.0, "b": 2810.0}, "b", "a"),
+        ({"ab": 3579.0, "a": 3397.0, "b": 2810.0}, "ab", ""),  # both are decided
+        ({"ab": 3579.0, "a": 2810.0, "b": 2700.0}, "b", ""),  # no detail: a fifth of the fall
+        ({"ab": 1000.0, "a": 910.0, "b": 990.0}, "b", ""),  # b explains more, and a mimics it
+        ({"abc": 1000.0, "ac": 945.0, "a": 300.0, "c": 900.0, "b": 500.0}, "bc", ""),  # c, which is decided
     ],
 )
-def test_a_detail_of_what_is_not_decided_is_no_claim(rest, survivors, core, found):
-    """A dial whose scale is bent: a wrong scale, or a misalignment, with an eccentric dial explain 3579 of chi2, and
-    the wrong scale alone 95 % of it."""
-    inner = SimpleNamespace(names=frozenset({"scale"}), fall=rest)
-    outcome = SimpleNamespace(
-        best=SimpleNamespace(fall=3579.0), survivors=[None] * survivors, core=core, without=lambda trial, name: inner
-    )
-    assert findings._detail_of(outcome, "eccentric") == found
+def test_a_detail_of_what_is_not_decided_is_no_claim(falls, core, found):
+    """A dial whose scale is bent: a wrong scale (a), or a misalignment, with an eccentric dial (b) explain 3579 of
+    chi2, and the wrong scale alone 95 % of it."""
+    trials = [SimpleNamespace(names=frozenset(names), fall=fall) for names, fall in [*falls.items(), ("", 0.0)]]
+    outcome = SimpleNamespace(best=trials[0], core=list(core), trials=trials)
+    assert findings._detail_of(outcome, "b") == found

@@ -436,6 +436,11 @@ GOOD = Findings(
         ({"law": "b along frame", "law_lead": SURE + 0.1}, "CLAIM"),
         ({"law": "b along frame", "law_lead": SURE - 0.1}, "AMBIGUOUS"),  # as over any other rival
         ({"unset": "analyzer.angle"}, "AMBIGUOUS"),  # a gain of each frame, or a dial that was off in each
+        ({"adds": 13.0, "priced": 20.4, "structure_p": 0.5, "excess_sd": 1.0}, "NOTHING"),  # a glare of 42 sizes
+        ({"adds": 13.0, "priced": 20.4}, "CANNOT_TELL"),
+        ({"adds": 13.0, "priced": 12.0, "structure_p": 0.5, "excess_sd": 1.0}, "CLAIM"),
+        ({"detail_of": "b", "survivors": 2}, "AMBIGUOUS"),
+        ({"detail_of": "b", "survivors": 2, "even": False, "some_even": False, "uneven": 0.4}, "PARTIAL"),
         ({"far": 80.0}, "CLAIM"),  # whatever its size, it explains all
         ({"far": 80.0, "complete": False}, "CLAIM"),
         # an axis 80 deg off that leaves structure, where a lamp had been turned up without end

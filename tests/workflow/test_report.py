@@ -292,7 +292,7 @@ def demo_diagnosis(rows, found, index, names) -> dict:
         "is left (p 0.31).",
         "conditions": [
             {"name": "an effect stands out", "holds": claim, "text": "family-wise p <1e-9 against 0.01"},
-            {"name": "structure is left", "holds": False, "text": "low-frequency test p 0.31 against 0.01"},
+            {"name": "structure is left", "holds": False, "text": "test of structure p 0.31 against 0.01"},
         ],
     }
     if not claim:
