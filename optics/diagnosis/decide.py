@@ -214,7 +214,8 @@ def _word_of_winner(f: Findings, failed: set[str]) -> str:
     refuted = {"held out"} if f.refuted else set()
     if failed & {"significant", "strength", PLAUSIBLE, CLUTTER, *refuted} and not f.structured and not f.weighed:
         # The refit did not bring the fall that the score promised, or the base's own calibration brought it; or the
-        # strength scatters as much between parts of the data; or frames that took no part do not know of it.
+        # strength scatters as much between parts of the data, or is too far from neutral for what it explains; or
+        # frames that took no part do not know of it.
         return "NOTHING"
     bars = {"share", CLUTTER, "near"}  # what is no tie between causes
     if not f.shared:  # where it is, noise is one of those that tie: that an effect gains little over it is no bar
@@ -267,22 +268,13 @@ def _against_effects(f: Findings) -> list[Condition]:
             if f.common
             else f"the data do not decide between {f.survivors} explanations, and no effect is part of all",
         ),
-        Condition(
+        _unless(
+            f.detail_of,
             NO_DETAIL,
-            float(bool(f.detail_of)),
-            0.0,
-            not f.detail_of,
-            f"it may be a detail of {f.detail_of}, which explains nearly all without it and is not decided"
-            if f.detail_of
-            else "nothing that is not decided explains nearly all without it",
+            f"it may be a detail of {f.detail_of}, which explains nearly all without it and is not decided",
+            "nothing that is not decided explains nearly all without it",
         ),
-        Condition(
-            "robust",
-            float(bool(f.fragile)),
-            0.0,
-            not f.fragile,
-            f"other weights or masks prefer {f.fragile}" if f.fragile else "other weights and masks agree",
-        ),
+        _unless(f.fragile, "robust", f"other weights or masks prefer {f.fragile}", "other weights and masks agree"),
         Condition(
             RIVALS,
             float(len(f.untried)),
@@ -294,6 +286,11 @@ def _against_effects(f: Findings) -> list[Condition]:
             else "every pair that may explain more by its score was calibrated",
         ),
     ]
+
+
+def _unless(found: str, name: str, text: str, otherwise: str) -> Condition:
+    """A condition that holds unless something was found, with the text for either case."""
+    return Condition(name, float(bool(found)), 0.0, not found, text if found else otherwise)
 
 
 def _first_of(names: Sequence[str]) -> str:
@@ -323,14 +320,11 @@ def _against_causes_outside(f: Findings) -> list[Condition]:
             if f.law
             else "no effect that the model has explains it by another law",
         ),
-        Condition(
+        _unless(
+            f.unset,
             DIALS,
-            float(bool(f.unset)),
-            0.0,
-            not f.unset,
-            f"errors of {f.unset}, which captures do not state, act on every frame too: give them under [uncertainty]"
-            if f.unset
-            else "no error of a dial that nobody states acts as it does",
+            f"errors of {f.unset}, which captures do not state, act on every frame too: give them under [uncertainty]",
+            "no error of a dial that nobody states acts as it does",
         ),
         Condition(
             "share",

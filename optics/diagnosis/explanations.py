@@ -285,9 +285,13 @@ def cost_of(case: Case, members: Sequence[Candidate], found: Fit) -> float:
         inner, size = covariance[np.ix_(known, known)], t[known]
         scaled, moved = inner / np.outer(size, size), change[known] / size
         total = _width_cost(scaled, np.where(by_frame[known], moved, 0.0), by_frame[known])
-    for c in members:
-        total += implausible(c, np.array([value_of(case.model, found.values, v) for v in c.variables]) - c.start)
-    return total
+    return total + farness(case, members, found) + EACH * len(members)
+
+
+def farness(case: Case, members: Sequence[Candidate], found: Fit) -> float:
+    """What it costs that the strengths of a refit are far from neutral: 3 ln(1 + x^2/2) of each effect."""
+    changes = [(c, np.array([value_of(case.model, found.values, v) for v in c.variables]) - c.start) for c in members]
+    return sum(implausible(c, change) - EACH for c, change in changes)
 
 
 def _width_cost(covariance: np.ndarray, change: np.ndarray, by_frame: np.ndarray) -> float:
@@ -1050,13 +1054,6 @@ def _without(case: Case, outcome: Outcome, subject: Candidate) -> tuple[Trial, f
             needed = max(needed, SURE if by_data else NO_TIE)
         found.append((rival, lead, needed))
     return min(found, key=lambda t: t[1] - t[2])
-
-
-def farness(case: Case, trial: Trial) -> float:
-    """What it costs an explanation that its strengths are far from neutral: 3 ln(1 + x^2/2) of each effect."""
-    values = trial.fit.values
-    changes = [(c, np.array([value_of(case.model, values, v) for v in c.variables]) - c.start) for c in trial.members]
-    return sum(implausible(c, change) - EACH for c, change in changes)
 
 
 def fall_over_noise(case: Case, outcome: Outcome, name: str) -> float:

@@ -187,7 +187,8 @@ def _of_subject(
     carried, carried_by = _carried(case, outcome, subject)
     strength = [value_of(case.model, best.fit.values, v) for v in subject.variables]
     fall, held_out = fall_over_noise(case, outcome, name), levels[-1].fall if len(levels) > 1 else math.nan
-    priced = farness(case, best) - farness(case, outcome.without(best, name))
+    rest = outcome.without(best, name)
+    priced = farness(case, best.members, best.fit) - farness(case, rest.members, rest.fit)
     return Findings(
         table.p_best,
         basis.structure_p,

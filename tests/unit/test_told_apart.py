@@ -95,9 +95,9 @@ def test_what_it_costs_to_be_far_from_plausible(monkeypatch, strength, cost):
     """A glare of 42 plausible sizes, 3 ln(1 + 42^2/2), or of one."""
     effect = SimpleNamespace(name="glare", scope="scene")
     glare = SimpleNamespace(effect=effect, variables=["glare"], start=np.zeros(1), plausible=np.array([0.02]))
-    trial = SimpleNamespace(members=[glare], fit=SimpleNamespace(values=None))
+    fit, case = SimpleNamespace(values=None), SimpleNamespace(model=None)
     monkeypatch.setattr(explanations, "value_of", lambda *a: strength)
-    assert explanations.farness(SimpleNamespace(model=None), trial) == pytest.approx(cost, abs=0.05)
+    assert explanations.farness(case, [glare], fit) == pytest.approx(cost, abs=0.05)
 
 
 @pytest.mark.parametrize(
