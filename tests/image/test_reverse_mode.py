@@ -75,6 +75,7 @@ class Plain:
         scale = np.abs(image).mean((0, 1))
         weights = np.random.default_rng(2).uniform(0.5, 1.5, image.shape)
         self.base, self.weights = image, np.where(scale > 1e-6 * scale.max(), weights / np.maximum(scale, 1e-30), 0.0)
+        self.bright = np.abs(image * self.weights).max()
 
     def image(self, steps=None):
         """The image with some parameters moved, in plausible sizes."""
@@ -95,7 +96,7 @@ class Plain:
         step = STEP_PX if any(self.numbers[k][1].unit == "px" for k in steps) else STEP
         up, down = (self.image({k: s * step * v for k, v in steps.items()}) for s in (1, -1))
         change, curve = (np.abs(d * self.weights).max(-1) for d in (up - down, up + down - 2 * self.base))
-        return (up - down) / (2 * step), curve <= CURVED * np.median(change) + FLOAT * self.weights.max()
+        return (up - down) / (2 * step), curve <= CURVED * np.median(change) + FLOAT * self.bright
 
     def attached(self):
         """All parameters, with derivatives; mi.render takes the same samples as `image` for them."""
