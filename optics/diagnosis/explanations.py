@@ -651,8 +651,10 @@ def _joined(case: Case, trials: dict[frozenset[str], Trial]) -> list[frozenset[s
     as noise. By the first ranking no pair may be worth a refit then, while the refit of the right one would show that
     the lamp stands still. What refits reach is asked of the pairs that come after them."""
     _bound_wander(case, trials.values())
-    live = [c for c in case.table.order if c.row.p_family < LEVEL and len(c.cone.live) and not c.broken]
-    ranked = pairs.ranked(case.evidence, live[: pairs.CONSIDERED])
+    live = [c for c in case.table.order if len(c.cone.live) and not c.broken]
+    leaders = [c for c in live if c.row.p_family < LEVEL][: pairs.CONSIDERED]
+    known = {c.effect.name for c in leaders}
+    ranked = pairs.ranked(case.evidence, leaders, [c for c in live if c.effect.name not in known])
     scale = _scale(case, trials.values())
     rankings = [
         _Ranking(

@@ -1,10 +1,13 @@
 """Pairs of effects, ranked by the linear fall of chi2 that both make together, T = u' V^-1 u over the columns of both.
-`shortfall` says what the refits of each alone fell short of their own T: so much less is expected of a pair."""
+`shortfall` says what the refits of each alone fell short of their own T: so much less is expected of a pair.
+
+One of the two stands out by itself. The other need not: beside a strong effect a weak one may ask for a sign that it
+cannot have, as a haze beside a bent response did, which explained nothing alone and 45,000 of chi2 with it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import combinations
+from itertools import chain, combinations, product
 
 import numpy as np
 
@@ -12,18 +15,22 @@ from optics.diagnosis import statistics as st
 from optics.diagnosis.evidence import Candidate, Evidence
 from optics.diagnosis.thresholds import MARGIN
 
-CONSIDERED = 10  # effects, the best by themselves: 45 pairs
+CONSIDERED = 10  # effects, the best by themselves, each with all others: some 500 pairs
 REFITTED = 8  # pairs at most: each costs a calibration
 # Of the fall: by how much two effects must do better than one to be refitted
 LEAD = MARGIN / 4
 
 
-def ranked(evidence: Evidence, candidates: Sequence[Candidate]) -> list[tuple[float, Candidate, Candidate, np.ndarray]]:
-    """(expected fall less its degrees of freedom, a, b, coefficients of both), best first."""
+def ranked(
+    evidence: Evidence, candidates: Sequence[Candidate], others: Sequence[Candidate] = ()
+) -> list[tuple[float, Candidate, Candidate, np.ndarray]]:
+    """(expected fall less its degrees of freedom, a, b, coefficients of both), best first: of pairs of candidates, and
+    of each of these with each of the others."""
     projected, first, found = evidence.projected, len(evidence.base), []
-    for a, b in combinations(candidates, 2):
-        if any(c.contains(d) for c in (a, b) for d in candidates):
-            continue  # the effect within it is tried
+    # where an effect lies within another one, that one is tried
+    candidates = [a for a in candidates if not any(a.contains(d) for d in candidates)]
+    others = [b for b in others if not any(b.contains(d) for d in (*candidates, *others))]
+    for a, b in chain(combinations(candidates, 2), product(candidates, others)):
         if {key for v in a.variables for key in v.keys} & {key for v in b.variables for key in v.keys}:
             continue
         own, live = (

@@ -90,9 +90,8 @@ class Refits:
 
     def _calibrate_ahead(self, sets: Sequence[Sequence[Variable]], say: Callable[[str, int, int], None]) -> None:
         """The calibrations that chord steps call for, several at once where processes share them."""
-        leader = self.leader() if sets else 0.0
-        open_ = [extra for extra in sets if self.unfinished(self.chords[_names(extra)], leader)]
-        jobs = [partial(_tried, make=partial(_calibrated, **self._calibrated_of(extra, leader))) for extra in open_]
+        open_ = [extra for extra in sets if self.unfinished(extra)]
+        jobs = [partial(_tried, make=partial(_calibrated, **self._calibrated_of(extra))) for extra in open_]
         if jobs:
             say("calibrations", 0, len(jobs))
         for n, (k, found) in enumerate(self.model.each(self.base.frames, jobs), 1):
@@ -158,25 +157,28 @@ class Refits:
         steps = {v.name: self.steps[v.name] for v in extra if v.name in self.steps}
         return {"base": self.base, "extra": extra, "secant": steps, "seed": self.setup.seed, "negligible": self.coarse}
 
-    def leader(self) -> float:
-        """The best fall so far."""
-        return max(map(self.fall, (*self.chords.values(), *self.results.values())))
+    def leader(self, extra: Sequence[Variable]) -> float:
+        """The best fall so far of what these variables compete with.
 
-    def unfinished(self, quick: Fit, leader: float) -> bool:
+        A strength per frame takes up whatever wanders from frame to frame, which is no reason to leave laws that all
+        frames share unfinished: those are held against each other."""
+        fits = (*self.chords.values(), *self.results.values())
+        alike = [fit for fit in fits if _per_frame(extra) or not _per_frame(self._extra_of(fit))]
+        return max(map(self.fall, alike))
+
+    def unfinished(self, extra: Sequence[Variable]) -> bool:
         """Whether chord steps have no end but come near the best, or were promised to."""
+        quick = self.chord(extra)
         ended = quick.converged and self.fall(quick) > AS_PROMISED * quick.promised
-        return not ended and max(self.fall(quick), quick.promised) > PROMISING * leader
+        return not ended and max(self.fall(quick), quick.promised) > PROMISING * self.leader(extra)
 
     def calibrated(self, extra: Sequence[Variable]) -> Fit:
         """The fit by chord steps, or the calibration that these call for."""
-        quick, leader = self.chord(extra), self.leader()
-        return (
-            _calibrated(self.model, **self._calibrated_of(extra, leader)) if self.unfinished(quick, leader) else quick
-        )
+        return _calibrated(self.model, **self._calibrated_of(extra)) if self.unfinished(extra) else self.chord(extra)
 
-    def _calibrated_of(self, extra: Sequence[Variable], leader: float) -> dict[str, Any]:
+    def _calibrated_of(self, extra: Sequence[Variable]) -> dict[str, Any]:
         """What `_calibrated` needs beside the model."""
-        quick, before, near = self.chord(extra), self.minimised(self.base), PROMISING * leader
+        quick, before, near = self.chord(extra), self.minimised(self.base), PROMISING * self.leader(extra)
         return {
             "quick": quick,
             "enough": before - AS_PROMISED * quick.promised,
@@ -222,7 +224,10 @@ class Refits:
 
     def _extra(self, found: Fit) -> tuple[str, ...]:
         """Names of a refit's variables that the base has not."""
-        return tuple(v.name for v in found.variables if v.name not in self.known)
+        return _names(self._extra_of(found))
+
+    def _extra_of(self, found: Fit) -> list[Variable]:
+        return [v for v in found.variables if v.name not in self.known]
 
     def _least(self, found: Fit) -> tuple[float, float]:
         """(chi2 and priors, each counted once, at the minimum that a fit's last linearisation expects; by how much that
@@ -303,6 +308,10 @@ class Refits:
 # -- which any process may make ----------------------------------------------------------------------------------------
 def _names(extra: Sequence[Variable]) -> tuple[str, ...]:
     return tuple(v.name for v in extra)
+
+
+def _per_frame(extra: Sequence[Variable]) -> bool:
+    return any(v.frames is not None for v in extra)
 
 
 def _tried(model: SceneModel, make: Callable[[SceneModel], Fit]) -> Fit | None:

@@ -1092,27 +1092,45 @@ def test_values_are_not_changed_by_a_diagnosis():
 def test_pairs_expect_nothing_of_what_the_projection_left_as_rounding():
     """b has a second strength that shows nowhere, as of a film that no frame turns: its share of chi2 would be rounding
     over rounding."""
-    information, score = np.diag([4.0, 9.0, 1e-9]), np.array([8.0, 9.0, 1.0])  # falls of 16, 9, and 1e9
+    evidence, candidate = of_pairs(np.diag([4.0, 9.0, 1e-9]), np.array([8.0, 9.0, 1.0]), seen=2)  # 16, 9, and 1e9
+    a, b = candidate("a", [0]), candidate("b", [1, 2])
+    ((fall, *both, linear),) = pairs.ranked(evidence, [a, b])
+    assert both == [a, b] and np.isclose(fall, 16 + 9 - 2) and np.allclose(linear, [2, 1, 0])
+
+
+def of_pairs(information, score, seen):
+    """Evidence with these numbers, and what makes a candidate of its columns, of which the first ones show."""
     variables = [Variable(key, (key,), Slope.parameters["lamp.slope"]) for key in "abc"]
 
-    def candidate(name, columns):
-        own = [variables[i] for i in columns]
-        seen = np.array([i < 2 for i in columns], float)
-        cone = st.Cone(information[np.ix_(columns, columns)] * np.outer(seen, seen), [0] * len(own))
+    def candidate(name, columns, side=0):
+        shown = np.array([i < seen for i in columns], float)
+        cone = st.Cone(information[np.ix_(columns, columns)] * np.outer(shown, shown), [side] * len(columns))
         return Candidate(
-            Effect(name, "lamp", ("slope",)),
-            own,
-            np.zeros(len(own)),
-            [0] * len(own),
-            np.ones(len(own)),
+            Effect(name, "lamp", tuple(variables[i].name for i in columns)),
+            [variables[i] for i in columns],
+            np.zeros(len(columns)),
+            [side] * len(columns),
+            np.ones(len(columns)),
             columns=columns,
             cone=cone,
         )
 
-    a, b = candidate("a", [0]), candidate("b", [1, 2])
-    evidence = SimpleNamespace(base=[], projected=SimpleNamespace(information=information, score=score))
-    ((fall, *both, linear),) = pairs.ranked(evidence, [a, b])
-    assert both == [a, b] and np.isclose(fall, 16 + 9 - 2) and np.allclose(linear, [2, 1, 0])
+    return SimpleNamespace(base=[], projected=SimpleNamespace(information=information, score=score)), candidate
+
+
+def test_a_pair_may_hold_an_effect_that_explains_nothing_alone():
+    """A haze, which may only rise, asks for less than none beside a response that bends; with the bend, for 4. What no
+    candidate stands beside is no pair, nor is one with an effect that contains another."""
+    information = np.array([[10.0, -6.0, 0.0], [-6.0, 10.0, 0.0], [0.0, 0.0, 1.0]])
+    evidence, candidate = of_pairs(information, information @ [10.0, 4.0, 0.0], seen=3)
+    bend, haze, third = candidate("bend", [0]), candidate("haze", [1], side=1), candidate("third", [2])
+    assert evidence.projected.score[1] < 0 and haze.cone.solve(evidence.projected.score[1:2])[0] == 0
+    (fall, *both, linear), (_, _, other, _) = pairs.ranked(evidence, [bend], [haze, third])
+    assert both == [bend, haze] and other is third and np.allclose(linear, [10, 4])
+    assert np.isclose(fall, np.array([10, 4]) @ information[:2, :2] @ [10, 4] - 2)
+    coloured = candidate("coloured haze", [1, 2], side=1)
+    assert coloured.contains(haze)
+    assert [both for _, *both, _ in pairs.ranked(evidence, [bend], [coloured, haze])] == [[bend, haze]]
 
 
 def test_pairs_keep_no_more_of_a_promise_than_their_members_did():

@@ -1,5 +1,6 @@
 """Large images are diagnosed in cells: their noise, the same scene in cells, and refits that are taken up again."""
 
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -85,6 +86,25 @@ def test_a_scene_in_cells_looks_the_same(mitsuba, size):
     back = cells.values_back(cells.values_into(Values({k: v for k, v in values.items() if cells.turns(k)})))
     for key, value in back.common.items():
         assert value == pytest.approx(values[key], abs=1e-9)
+
+
+@pytest.mark.parametrize("frames, unfinished", [(None, False), ((0,), True)])
+def test_a_strength_per_frame_leaves_no_law_of_all_frames_unfinished(frames, unfinished):
+    """Chord steps brought 60 of the 270 that they promised. Beside a law that brought 580 that is no matter; a gain of
+    each frame, which may be a lamp that wanders, is no such law."""
+    p = Parameter("a", "1", 0.0, (-1.0, 1.0), "a number", plausible=1.0)
+    known, best, bent = Variable("a", ("m.a",), p), Variable("g", ("m.g",), p, frames), Variable("b", ("m.b",), p)
+
+    def fit(variables, chi2, converged=True, promised=math.nan):
+        numbers = [0.0] * len(variables), np.eye(len(variables)), chi2, 90, [0], [chi2], [99], converged, ""
+        return Fit(Values({v.keys[0]: 0.0 for v in variables}), variables, *numbers, promised=promised)
+
+    base = fit([known], 1000.0)
+    base.normal = object()
+    refits = Refits(SimpleNamespace(captures=SimpleNamespace(table=None)), Setup("captures"), base, [])
+    refits.chords = {("g",): fit([known, best], 420.0, promised=580.0), ("b",): fit([known, bent], 940.0, False, 270.0)}
+    assert refits.unfinished([bent]) is unfinished
+    assert not refits.unfinished([best])
 
 
 def test_a_refit_is_taken_up_again(tmp_path, monkeypatch):
