@@ -1119,14 +1119,15 @@ def of_pairs(information, score, seen):
 
 
 def test_a_pair_may_hold_an_effect_that_explains_nothing_alone():
-    """A haze, which may only rise, asks for less than none beside a response that bends; with the bend, for 4. What no
-    candidate stands beside is no pair, nor is one with an effect that contains another."""
+    """A haze, which may only rise, asks for less than none beside a response that bends; with the bend, for 4. What
+    adds nothing to the bend is no pair with it, nor is what contains the haze."""
     information = np.array([[10.0, -6.0, 0.0], [-6.0, 10.0, 0.0], [0.0, 0.0, 1.0]])
     evidence, candidate = of_pairs(information, information @ [10.0, 4.0, 0.0], seen=3)
     bend, haze, third = candidate("bend", [0]), candidate("haze", [1], side=1), candidate("third", [2])
     assert evidence.projected.score[1] < 0 and haze.cone.solve(evidence.projected.score[1:2])[0] == 0
-    (fall, *both, linear), (_, _, other, _) = pairs.ranked(evidence, [bend], [haze, third])
-    assert both == [bend, haze] and other is third and np.allclose(linear, [10, 4])
+    bend.row = SimpleNamespace(net=bend.cone.solve(evidence.projected.score[:1])[0])
+    ((fall, *both, linear),) = pairs.ranked(evidence, [bend], [haze, third])
+    assert both == [bend, haze] and np.allclose(linear, [10, 4])
     assert np.isclose(fall, np.array([10, 4]) @ information[:2, :2] @ [10, 4] - 2)
     coloured = candidate("coloured haze", [1, 2], side=1)
     assert coloured.contains(haze)
