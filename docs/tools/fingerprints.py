@@ -115,6 +115,7 @@ SHOWN: dict[str, tuple[View, tuple[str, ...] | None]] = {
     "dark-drift": (View("polarizer_bench", {}, {}, "source.time", (0.0, 30.0)), None),
     "polarized-source": (View("polarizer_bench", {}, {"analyzer.inserted": 0.0}, "polarizer.angle"), None),
     "retardance": (CROSSED, None),
+    "dichroism": (CROSSED, None),
     "optical-rotation": (BENCH, None),
     "twisted-plate": (View("polarizer_bench", {"analyzer": "90"}, {"sample.retard_0": 180.0}, "sample.angle"), None),
     "sample-absorption": (View("polariscope", {"width": "180", "height": "135", "analyzer": "45"}), ("sample",)),

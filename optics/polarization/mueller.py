@@ -184,6 +184,27 @@ def diattenuator(q, u, t1, t2) -> Mueller:
     )
 
 
+def dichroic(a, b) -> Mueller:
+    """Diattenuator of a mean transmittance of 1 and the diattenuation D = sqrt(a^2 + b^2) < 1 along phi: a = D cos(2
+    phi), b = D sin(2 phi); analytic through D = 0, where phi has no meaning.
+
+        M = [[1, a, b, 0], [a, c + g a^2, g a b, 0], [b, g a b, c + g b^2, 0], [0, 0, 0, c]]
+    with c = sqrt(1 - D^2) and g = (1 - c)/D^2 = 1/(1 + c). Lu & Chipman, J. Opt. Soc. Am. A 13, 1106 (1996), eq. (18).
+    """
+    rest = 1 - a * a - b * b
+    dark = real(rest) <= 1e-14
+    c = where(dark, 0.0 * rest, sqrt(where(dark, 1.0, rest)))
+    g = 1 / (1 + c)
+    return Mueller(
+        [
+            [1.0, a, b, 0],
+            [a, c + g * (a * a), g * (a * b), 0],
+            [b, g * (a * b), c + g * (b * b), 0],
+            [0, 0, 0, c],
+        ]
+    )
+
+
 def retarder(a, b) -> Mueller:
     """Linear retarder of the retardance delta = sqrt(a^2 + b^2) (rad) with the fast axis at phi: a = delta cos(2 phi),
     b = delta sin(2 phi); analytic through delta = 0, where phi has no meaning.

@@ -189,6 +189,7 @@ def library_key(number):
     if film in bench.FILMS:
         return f"{film}.{own.get(rest, rest)}"
     part = {"haze": "sample.depolarization", "plate_0": "sample.retard_0", "plate_45": "sample.retard_45"}
+    part |= {"dichroic_q": "sample.dichroism_0", "dichroic_u": "sample.dichroism_45"}
     lamp = {"lamp_q": "source.dop_q", "lamp_u": "source.dop_u", "drift": "source.drift"}
     meter = {"dark": "camera.offset", "bend": "camera.response_bend"}
     return {**part, **lamp, **meter}.get(number, f"camera.{number}")

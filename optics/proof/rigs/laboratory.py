@@ -69,7 +69,7 @@ SAME_BY_OTHER_LAW: Mapping[str, Mapping[str, str]] = {
     },
     "dark offset": {"dark drift": "the other law grows with the clock and settles: what the library calls so"},
 }
-IN_SAMPLE = {"retardance", "stress birefringence", "depolarization", "dichroic sample"}
+IN_SAMPLE = {"retardance", "stress birefringence", "depolarization", "dichroism"}
 
 
 class Laboratory(Rig):
@@ -304,6 +304,7 @@ class Polarimeter(Laboratory):
         "coloured leak",
         "depolarization",
         "retardance",
+        "dichroism",
         "stress birefringence",
         "polarized detector",
         "source drift",
@@ -312,7 +313,7 @@ class Polarimeter(Laboratory):
         "stray light",
     )
     others = _known(effects)
-    unknown = _odd("dichroic sample", "range step", "lamp step")
+    unknown = _odd("range step", "lamp step")
 
 
 class Laser(Polarimeter):
@@ -342,6 +343,7 @@ class Phone(Laboratory):
         "coloured leak",
         "depolarization",
         "retardance",
+        "dichroism",
         "polarized source",
         "polarized detector",
         "camera gamma",
@@ -351,7 +353,7 @@ class Phone(Laboratory):
         "colour crosstalk",
     )
     others = _known(effects)
-    unknown = _odd("dichroic sample", "striped film", "range step")
+    unknown = _odd("striped film", "range step")
 
 
 class Photographs(Laboratory):
@@ -365,6 +367,7 @@ class Photographs(Laboratory):
         "extinction leak",
         "depolarization",
         "retardance",
+        "dichroism",
         "polarized detector",
         "camera gamma",
         "residual response curve",
@@ -374,7 +377,7 @@ class Photographs(Laboratory):
         "gain drift",
     )
     others = _known(effects)
-    unknown = _odd("dichroic sample", "range step")
+    unknown = _odd("range step")
     weakest, strongest = 0.05, 5.0  # a set has some ten thousand values
     nulls, pair_cells, frame_by_frame = 2, 2, True
 
@@ -397,6 +400,6 @@ class PolarizationCamera(Laboratory):
         "gain drift",
     )
     others = _known(effects)
-    unknown = _odd("dichroic sample", "range step")
+    unknown = _odd("range step")
     weakest, strongest = 0.05, 5.0  # a set has some thousand values
     nulls, pair_cells, frame_by_frame, usual = 2, 2, True, True

@@ -202,16 +202,6 @@ def _sample(b: Bench, light: np.ndarray, settings: Settings, wavelengths: np.nda
             light,
         )
     turn = _column(settings, "sample.angle", len(light))
-    ratio = GREEN / wavelengths
-    phase = np.hypot(b["plate_0"], b["plate_45"]) * ratio * (1 + b["dispersion"] * (ratio**2 - 1))
-    fast = np.degrees(np.arctan2(b["plate_45"], b["plate_0"])) / 2 + turn
-    layers = TWISTED if b["twist"] else 1
-    if phase.any():
-        for k in range(layers):
-            angle = fast + b["twist"] * ((k + 0.5) / layers - 0.5)
-            c, s = np.cos(np.radians(phase / layers)), np.sin(np.radians(phase / layers))
-            i, q, u, v = np.moveaxis(_turned(light, angle), -1, 0)
-            light = _turned(np.stack([i, q, c * u + s * v, c * v - s * u], -1), -angle)
     if b["dichroic_q"] or b["dichroic_u"]:
         i, q, u, v = np.moveaxis(_turned(light, turn), -1, 0)
         d = np.hypot(b["dichroic_q"], b["dichroic_u"])
@@ -224,6 +214,16 @@ def _sample(b: Bench, light: np.ndarray, settings: Settings, wavelengths: np.nda
             (across * v),
         )
         light = _turned(np.stack([i + d * along, q, u, v], -1), -turn)
+    ratio = GREEN / wavelengths
+    phase = np.hypot(b["plate_0"], b["plate_45"]) * ratio * (1 + b["dispersion"] * (ratio**2 - 1))
+    fast = np.degrees(np.arctan2(b["plate_45"], b["plate_0"])) / 2 + turn
+    layers = TWISTED if b["twist"] else 1
+    if phase.any():
+        for k in range(layers):
+            angle = fast + b["twist"] * ((k + 0.5) / layers - 0.5)
+            c, s = np.cos(np.radians(phase / layers)), np.sin(np.radians(phase / layers))
+            i, q, u, v = np.moveaxis(_turned(light, angle), -1, 0)
+            light = _turned(np.stack([i, q, c * u + s * v, c * v - s * u], -1), -angle)
     return light * np.array([1.0, *[1 - b["haze"]] * 3])
 
 

@@ -135,6 +135,7 @@ CAUSES: dict[str, Cause] = {
         law="the plate's axis turns by 25 degrees from face to face",
     ),
     "stress birefringence": Cause(**_up("plate_0"), most=160),
+    "dichroism": Cause(**_plane("dichroic_q", "dichroic_u"), most=0.6),
     "polarized source": Cause(**_plane("lamp_q", "lamp_u"), most=0.9),
     "polarized detector": Cause(
         **_plane("detector_q", "detector_u"),
@@ -211,5 +212,4 @@ UNKNOWN: dict[str, tuple[Callable[[np.random.Generator, Sequence[str]], Directio
     "fatigue": (lambda rng, turned: {"fatigue": 1.0}, 1.0, ("reading", "source.time", "intensity", *DIALS)),
     "range step": (lambda rng, turned: {"range_step": rng.choice([-1.0, 1.0])}, 0.3, ("intensity", "analyzer.angle")),
     "lamp step": (lambda rng, turned: {"lamp_step": rng.choice([-1.0, 1.0])}, 0.3, ("source.time", "reading", "frame")),
-    "dichroic sample": (_plane("dichroic_q", "dichroic_u")["draw"], 0.9, ("analyzer.angle", "sample.angle")),
 }

@@ -117,6 +117,7 @@ ON_PIXELS = (
     "stray light",
     "depolarization",
     "retardance",
+    "dichroism",
     "gain drift",
 )
 
@@ -137,7 +138,7 @@ def rivals(session: Session) -> list[str]:
     if not any(key.endswith(".approach") for key in session.settings):
         found = [c for c in found if c != "servo backlash"]
     if "sample" in session.absent:
-        found = [c for c in found if c not in ("depolarization", "retardance", "stress birefringence")]
+        found = [c for c in found if c not in ("depolarization", "retardance", "stress birefringence", "dichroism")]
     return [c for c in found if c not in session.exclude]
 
 

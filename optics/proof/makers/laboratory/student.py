@@ -98,7 +98,7 @@ def known(found: Session, hidden: tuple[str, ...], rng: np.random.Generator) -> 
     """With what its owner writes of parts that are not there, of causes that he has excluded, with his reasons, and of
     a gain that is fixed: all true of this bench."""
     absent = [film for film in FILMS if not found.inside(film) and rng.random() < 0.5]
-    if not {"depolarization", "retardance", "stress birefringence", "dichroic sample"} & {*hidden}:
+    if not {"depolarization", "retardance", "stress birefringence", "dichroism"} & {*hidden}:
         absent += ["sample"] if not found.base and found.plate_in and rng.random() < 0.5 else []
     exclude = {cause: why for cause, why in REASONS.items() if cause not in hidden and rng.random() < 0.25}
     fixed = {**found.fixed, "camera.gain": 1.0} if rng.random() < 0.5 else found.fixed
