@@ -49,14 +49,18 @@ KINDS = ("amplifier", "lamp")
 
 @dataclass(frozen=True)
 class Correlation:
-    """scale, power, length and kind of V; gain: twice the log likelihood, restricted or less what is implausible, over
-    that of white noise."""
+    """scale, power, length and kind of V.
+
+    gain    twice the log likelihood, restricted or less what is implausible, over that of white noise
+    price   what the noise costs of that, by determinants and by what is implausible; 0 where it is restricted
+    """
 
     scale: float = 1.0
     power: float = 0.0
     length: float = 1.0
     kind: str = KINDS[0]
     gain: float = 0.0
+    price: float = 0.0
 
     @property
     def share(self) -> float:
@@ -139,7 +143,8 @@ class Readings:
             gains = self.white / scale - (left / scale + logs + x2)
             i = int(np.argmax(gains))
             if gains[i] > best.gain:
-                best = Correlation(scale, float(self.power[i]), float(self.length[i]), kind, float(gains[i]))
+                price = float((logs + x2)[i])
+                best = Correlation(scale, float(self.power[i]), float(self.length[i]), kind, float(gains[i]), price)
         return best
 
     def correlation(self) -> Correlation:

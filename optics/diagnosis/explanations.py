@@ -85,6 +85,7 @@ class Trial:
     members    effects, none for the base;   fit, fall, after, expected, images   as of `optics.diagnosis.refit.Attempt`
     cost       see the module
     deviance   see the module; NaN before the competition;   gain: what shared noise lowers it by
+    price      of images, what a lamp that wanders costs of it (`optics.diagnosis.correlation.Correlation`)
     readings   of a table, or frames of images, about it; None before
     settled    chi2 of its priors beside a lamp, by the lamp (`_from_priors`)
     bare       whether it leaves no more of images than noise that is stated too small (MISSTATED), without structure,
@@ -105,6 +106,7 @@ class Trial:
     structure_p: float = math.nan
     deviance: float = math.nan
     gain: float = 0.0
+    price: float = 0.0
     readings: Readings | None = None
     settled: dict[tuple[float, float], tuple[float, float]] = field(default_factory=dict)
     bare: bool = False
@@ -747,9 +749,17 @@ def _bound_wander(case: Case, trials: Iterable[Trial]) -> None:
         case.lamp.most = most
 
 
+def _lamp_noise(case: Case, trial: Trial, scale: float) -> Correlation:
+    """The noise that frames share with their neighbours about an explanation of images; none where it has a gain of
+    each frame."""
+    if case.lamp is None or trial.by_frame:
+        return Correlation(scale)
+    return _of_frames(case, case.lamp, trial).noise(scale)
+
+
 def _gain(case: Case, trial: Trial, scale: float) -> float:
-    """By how much shared noise lowers the deviance of an explanation of images: 0 where it has a gain of each frame."""
-    return 0.0 if case.lamp is None or trial.by_frame else _of_frames(case, case.lamp, trial).noise(scale).gain
+    """By how much that noise lowers the deviance."""
+    return _lamp_noise(case, trial, scale).gain
 
 
 def _expected_gain(case: Case, members: Sequence[Candidate], scale: float) -> float:
@@ -790,7 +800,8 @@ def compete(case: Case, trials: list[Trial]) -> Outcome:
         order.sort(key=lambda t: t.deviance + t.cost)
     elif case.lamp is not None:
         for t in order:
-            t.gain = _gain(case, t, scale)
+            noise = _lamp_noise(case, t, scale)
+            t.gain, t.price = noise.gain, noise.price
             t.deviance -= t.gain
         order.sort(key=lambda t: t.deviance + t.cost)
     # whether there is anything is a question of its own, which costs do not answer
@@ -986,7 +997,9 @@ def _lead(case: Case, outcome: Outcome, best: Trial, other: Trial) -> tuple[floa
         data, shared = data + shared, 0.0
     lamp = shared
     if not is_table:
-        data = _less_alike(case, outcome, outcome.scale * data, best, other)
+        # a lamp is judged by whole frames, and pixels that miss alike have no part in that
+        price = other.price - best.price if lamp else 0.0
+        data = _less_alike(case, outcome, outcome.scale * (data - price), best, other) + price
     lead, needed = data + cost, TOLD if data > TOLD else CLEAR  # what is plausible decides alone only where it is clear
     if other.keys < best.keys:
         significant = data - _significant(case, best, other)

@@ -183,6 +183,7 @@ def test_a_lamp_rules_out_nothing_that_leaves_less_where_misfit_is_left(monkeypa
             keys={name},
             deviance=deviance,
             gain=gain,
+            price=0.0,
             fall=fall,
             cost=cost,
             fit=fit,
@@ -200,6 +201,23 @@ def test_a_lamp_rules_out_nothing_that_leaves_less_where_misfit_is_left(monkeypa
     assert (lead > needed) is ruled_out
 
 
+def test_what_a_lamp_costs_is_judged_by_frames_and_not_by_pixels(monkeypatch):
+    """Without effects a lamp would have to swing by 18 %, which costs 200; beside a polarized detector by 2 %, which
+    costs 10. Pixels that miss alike, as 18 times the noise, make no less of that."""
+
+    def trial(deviance, price, cost):
+        own = {"deviance": deviance, "price": price, "cost": cost, "fall": 0.0, "by_frame": False, "complete": True}
+        return SimpleNamespace(**own, keys={price}, gain=1e5, fit=SimpleNamespace(values=0.0))
+
+    best, other = trial(1010.0, 10.0, 32.0), trial(1218.0, 200.0, 0.0)
+    case = SimpleNamespace(lamp=None, evidence=SimpleNamespace(is_table=False))
+    case.prior_chi2 = case.known_chi2 = lambda values: 0.0
+    monkeypatch.setattr(explanations, "design_effect", lambda *a: 18.0)
+    other.gain = 2e5
+    lead, needed = explanations._lead(case, SimpleNamespace(scale=1.0), best, other)
+    assert lead == pytest.approx(190.0 + 18.0 / 18.0 - 32.0) and lead > needed
+
+
 @pytest.mark.parametrize("bare, brings, ruled_out", [(True, 400.0, False), (False, 400.0, True), (True, 0.001, True)])
 def test_what_leaves_an_unnoticed_lamp_is_a_rival_of_gains_of_each_frame(monkeypatch, bare, brings, ruled_out):
     """A gain of each frame leads a polarized detector by 3 in score; without the lamp that wanders beside the detector,
@@ -209,7 +227,8 @@ def test_what_leaves_an_unnoticed_lamp_is_a_rival_of_gains_of_each_frame(monkeyp
     def trial(name, deviance, gain, by_frame):
         values = {"keys": {name}, "deviance": deviance, "gain": gain, "by_frame": by_frame, "fall": 5000.0 - deviance}
         values["members"] = [SimpleNamespace(cone=SimpleNamespace(live=[0]))]
-        return SimpleNamespace(**values, cost=20.0, complete=True, bare=bare, fit=SimpleNamespace(values=0.0))
+        fit = SimpleNamespace(values=0.0)
+        return SimpleNamespace(**values, price=0.0, cost=20.0, complete=True, bare=bare, fit=fit)
 
     best, other = trial("gains", 1000.0, 0.0, True), trial("detector", 1003.0, 997.0, False)
     evidence = SimpleNamespace(is_table=False)
@@ -226,7 +245,7 @@ def test_misfit_that_is_left_beside_gains_of_each_frame_is_counted_without_a_lam
 
     def trial(deviance, gain, fall, by_frame, keys):
         own = {"deviance": deviance, "gain": gain, "fall": fall, "by_frame": by_frame, "keys": keys, "bare": False}
-        fit = SimpleNamespace(values=0.0)
+        fit, own["price"] = SimpleNamespace(values=0.0), 0.0
         return SimpleNamespace(**own, cost=40.0 * by_frame, complete=False, fit=fit, left=lambda dof: 320.0)
 
     best = trial(1130.0, 0.0, 2900.0, True, {"gains", "offset"})
