@@ -8,7 +8,7 @@ what so many strengths could have fitted (`optics.diagnosis.result.Fingerprint.c
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 import numpy as np
 from scipy.special import chdtrc
@@ -16,11 +16,13 @@ from scipy.stats import rankdata
 
 from optics.diagnosis import fingerprints as prints
 from optics.diagnosis import statistics as st
+from optics.diagnosis.dials import unstated
 from optics.diagnosis.evidence import Evidence
 from optics.diagnosis.result import Law
 from optics.diagnosis.session import Frames, Session
 from optics.diagnosis.thresholds import MIMICS
 from optics.fit.model import Model
+from optics.fit.scene_model import SceneModel
 from optics.scene.declare import Effect
 from optics.scene.parameter import Variable
 
@@ -48,7 +50,8 @@ def other_laws(
     """
     if not added:
         return []
-    turned = set(prints.settings(model, evidence))
+    turned = prints.settings(model, evidence)
+    unknown = _frame_by_frame(model, evidence, turned)
     common = set.intersection(*[set(p) for p in places])
     judge = _fall_of_readings(evidence, session, scale) if session is not None else _fall_of_images(evidence)
     found = []
@@ -56,7 +59,7 @@ def other_laws(
         keys = {key for v in variables_of(effect) for key in v.keys}
         own = [i for i in evidence.base if keys & set(evidence.columns[i].keys)]
         along = {*effect.acts, *((*turned, *ALWAYS) if evidence.is_table else ())}
-        for coordinate in sorted((along & common) - {*MIMICS}) if own else []:
+        for coordinate in sorted((along & common) - {*MIMICS} - unknown) if own else []:
             x = np.concatenate([p[coordinate] for p in places])
             laws = []
             for images in _strengths(evidence, own, x):
@@ -65,6 +68,14 @@ def other_laws(
                     laws.append(Law(effect.name, coordinate, fall, dof, float(chdtrc(dof, max(fall, 0.0))), plain))
             found += [max(laws, key=lambda law: law.score)] if laws else []
     return sorted(found, key=lambda law: -law.score)
+
+
+def _frame_by_frame(model: Model, evidence: Evidence, turned: Mapping[str, Sequence[float]]) -> set[str]:
+    """Dials of images that stand elsewhere in each frame, by errors that captures do not state: a law along such a
+    dial is a strength of each frame, and so is the error."""
+    if evidence.is_table or not isinstance(model, SceneModel):
+        return set()
+    return {key for key in unstated(model) if len(set(turned.get(key, ()))) == len(evidence.frames)}
 
 
 def _strengths(evidence: Evidence, own: Sequence[int], x: np.ndarray) -> Iterator[list[np.ndarray]]:

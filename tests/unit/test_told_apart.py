@@ -415,6 +415,23 @@ def test_another_law_falls_from_where_the_best_explanation_does(monkeypatch, by_
     assert findings.law_lead(case, outcome, 1300.0) == lead
 
 
+@pytest.mark.parametrize(
+    "angles, is_table, held",
+    [
+        ([0.0, 40.0, 80.0], False, {"analyzer.angle"}),
+        ([0.0, 40.0, 40.0], False, set()),
+        ([0.0, 40.0, 80.0], True, set()),
+    ],
+)
+def test_a_law_along_a_dial_of_unknown_errors_is_a_strength_of_each_frame(monkeypatch, angles, is_table, held):
+    """No law runs along it, unless several frames stand at one of its settings, or readings of a table do."""
+    monkeypatch.setattr(laws, "unstated", lambda model: ["analyzer.angle"])
+    monkeypatch.setattr(laws, "SceneModel", SimpleNamespace)
+    turned = {"analyzer.angle": angles, "sample.angle": [1.0, 2.0, 3.0]}
+    evidence = SimpleNamespace(is_table=is_table, frames=[0, 2, 3])
+    assert laws._frame_by_frame(SimpleNamespace(), evidence, turned) == held
+
+
 def test_a_law_falls_from_where_effects_fall():
     """By what readings share they have other weights than the fit had, so that a base stands off its optimum. An effect
     falls from there, and another law of the same image falls as far."""
