@@ -486,6 +486,8 @@ class SceneModel:
                 image = self._secant(values, variable, index, secant[variable.name], prediction, seed, at_once)
             elif variable.name in at_once:
                 image = linear.of_image(at_once[variable.name])
+                if self.developer.camera.clock in acts:
+                    image = image + linear.of_parameter((self.developer.camera.clock,))
             else:
                 with self.renderer.splitting(self._side(now)):
                     image = self._tangent(linear, now, acts, seed)
@@ -606,10 +608,11 @@ class SceneModel:
         self, linear, now: Mapping, acts: Mapping[str, float], seed: int, at_rest: bool = False
     ) -> np.ndarray | None:
         """d DN / d value in a frame for keys that share one value; None where nothing depends on them."""
-        camera = tuple(k for k in acts if self.parameters[k].how == "image")
+        own = {k for k in acts if self.parameters[k].how == "image"}
+        camera = tuple(k for k in acts if k in own or k == self.developer.camera.clock)
         light = None
         for key, factor in acts.items():
-            if key in camera:
+            if key in own:
                 continue
             change = self._light_tangent(now, key, factor, seed, at_rest)
             if change is not None:

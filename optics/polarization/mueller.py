@@ -73,6 +73,21 @@ def cosc(x2):
     return half * half / 2
 
 
+def tanhc(x2):
+    """tanh(x)/x for x^2, analytic at 0."""
+    small = real(x2) < 1e-4
+    x = sqrt(where(small, 1.0, x2))
+    fall = exp(-2 * x)
+    return where(small, 1 - x2 / 3 * (1 - 2 * x2 / 5 * (1 - 17 * x2 / 42)), (1 - fall) / ((1 + fall) * x))
+
+
+def sech(x2):
+    """1/cosh(x) for x^2, analytic at 0."""
+    small = real(x2) < 1e-4
+    fall = exp(-sqrt(where(small, 1.0, x2)))
+    return where(small, 1 - x2 / 2 * (1 - 5 * x2 / 12), 2 * fall / (1 + fall * fall))
+
+
 # -- matrices --------------------------------------------------------------------------------------------------------
 def _nothing(x) -> bool:
     return isinstance(x, int) and x == 0
@@ -185,21 +200,20 @@ def diattenuator(q, u, t1, t2) -> Mueller:
 
 
 def dichroic(a, b) -> Mueller:
-    """Diattenuator of a mean transmittance of 1 and the diattenuation D = sqrt(a^2 + b^2) < 1 along phi: a = D cos(2
-    phi), b = D sin(2 phi); analytic through D = 0, where phi has no meaning.
+    """Diattenuator whose mean transmittance is 1 and whose transmittances along its axis and across it have the ratio
+    exp(2 x), x = sqrt(a^2 + b^2): a = x cos(2 phi), b = x sin(2 phi); analytic through x = 0, where phi has no meaning.
 
-        M = [[1, a, b, 0], [a, c + g a^2, g a b, 0], [b, g a b, c + g b^2, 0], [0, 0, 0, c]]
-    with c = sqrt(1 - D^2) and g = (1 - c)/D^2 = 1/(1 + c). Lu & Chipman, J. Opt. Soc. Am. A 13, 1106 (1996), eq. (18).
-    """
-    rest = 1 - a * a - b * b
-    dark = real(rest) <= 1e-14
-    c = where(dark, 0.0 * rest, sqrt(where(dark, 1.0, rest)))
-    g = 1 / (1 + c)
+        M = [[1, t a, t b, 0], [t a, c + g a^2, g a b, 0], [t b, g a b, c + g b^2, 0], [0, 0, 0, c]]
+    with t = tanh(x)/x, c = 1/cosh(x) and g = (1 - c)/x^2; the diattenuation is t x. Lu & Chipman, J. Opt. Soc. Am. A
+    13, 1106 (1996), eq. (18)."""
+    square = a * a + b * b
+    t, c = tanhc(square), sech(square)
+    g = t * t / (1 + c)
     return Mueller(
         [
-            [1.0, a, b, 0],
-            [a, c + g * (a * a), g * (a * b), 0],
-            [b, g * (a * b), c + g * (b * b), 0],
+            [1.0, t * a, t * b, 0],
+            [t * a, c + g * (a * a), g * (a * b), 0],
+            [t * b, g * (a * b), c + g * (b * b), 0],
             [0, 0, 0, c],
         ]
     )

@@ -1214,8 +1214,8 @@ def layer_of(bench, kind, values):
 
 
 def check_realisable(bench, kind, seed):
-    """Within a plausible change of the bench a layer's own matrix, and that of each of its effects, is one of something
-    passive."""
+    """Within a plausible change of the bench a layer's own matrix, and what it and each of its effects do together, is
+    one of something passive. An effect may pass one polarization better on account of what the layer absorbs."""
     from optics.polarization.mueller import gain, physical
 
     rng = np.random.default_rng(seed)
@@ -1223,9 +1223,8 @@ def check_realisable(bench, kind, seed):
     for _ in range(5):
         layer = layer_of(bench, kind, {**bench.values, **draw(rng, bench)})
         crossing = crossings(rng, 40)
-        matrices = [e.stages["layer"](crossing, layer) for e in effects] + [
-            bench.scene.registry.parts[kind].mueller(crossing, layer)
-        ]
+        own = bench.scene.registry.parts[kind].mueller(crossing, layer)
+        matrices = [*(e.stages["layer"](crossing, layer) @ own for e in effects), own]
         for name, matrix in zip([*(e.name for e in effects), kind], matrices):
             m = matrix.numpy()
             assert np.isfinite(m).all()

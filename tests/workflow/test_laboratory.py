@@ -98,7 +98,7 @@ def test_limits_of_haze_of_a_twist_and_of_a_dichroic_sheet():
     turned = {f"sample.{k}": np.full(12, v) for k, v in (("angle", 22.5),)}
     assert seen(many, **turned) == pytest.approx(T1**2 / 2 * np.cos(np.radians(DIAL - 45)) ** 2, abs=0.02 * T1**2 / 2)
     # a sheet that absorbs one polarization whole is a film along the other, of T1 = 2 by its norm
-    sheet = seen({"dichroic_q": math.cos(math.radians(60)), "dichroic_u": math.sin(math.radians(60))})
+    sheet = seen({"dichroic_q": 20 * math.cos(math.radians(60)), "dichroic_u": 20 * math.sin(math.radians(60))})
     expected = T1**2 * np.cos(np.radians(30)) ** 2 * np.cos(np.radians(DIAL - 30)) ** 2
     assert sheet == pytest.approx(expected, abs=1e-12)
 

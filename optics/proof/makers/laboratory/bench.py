@@ -204,8 +204,8 @@ def _sample(b: Bench, light: np.ndarray, settings: Settings, wavelengths: np.nda
     turn = _column(settings, "sample.angle", len(light))
     if b["dichroic_q"] or b["dichroic_u"]:
         i, q, u, v = np.moveaxis(_turned(light, turn), -1, 0)
-        d = np.hypot(b["dichroic_q"], b["dichroic_u"])
-        n, m = b["dichroic_q"] / d, b["dichroic_u"] / d
+        x = np.hypot(b["dichroic_q"], b["dichroic_u"])  # half of the logarithm of the ratio of the transmittances
+        d, n, m = np.tanh(x), b["dichroic_q"] / x, b["dichroic_u"] / x
         along = q * n + u * m
         across = np.sqrt(1 - d * d)
         q, u, v = (
