@@ -165,3 +165,14 @@ def test_dials_that_never_turned_and_films_on_the_table_are_not_freed():
     assert [v.name for v in gauges.acting(model, own("offset"))] == ["first.offset", "second.offset"]
     shared = Variable("film.wobble", tuple(f"{film}.wobble" for film in FILMS), WOBBLE)
     assert [(v.name, v.keys) for v in gauges.acting(model, [shared])] == [("film.wobble", ("second.wobble",))]
+
+
+def test_gains_that_change_together_are_told_without_their_factors():
+    """Eleven gains of which dark frames hardly know any, beside a power that they make up for."""
+    names, change = [f"camera.gain[{i}]" for i in range(5)], np.array([1.0, 0.7, 0.68, 0.9, 1.0])
+    told = gauges._gauge_text(names, change, ["1"] * 5, logs=True)
+    assert told == (
+        "a change of camera.gain[0], camera.gain[1], camera.gain[2] and 2 more together, of some more than of others,"
+    )
+    opposed = gauges._gauge_text(names, change * [1, -1, 1, 1, 1], ["1"] * 5, logs=True)
+    assert opposed.startswith("a change of camera.gain[0] by a factor 2.72 with camera.gain[1] by a factor 0.497")
