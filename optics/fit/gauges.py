@@ -178,7 +178,9 @@ def strengths_told(fit: Fit | np.ndarray, variables: Sequence[Variable], values:
     told += [str(k) for k in found.known]
     if len(told) > LISTED:
         largest = max(range(len(apart)), key=lambda i: abs(values[apart[i]]), default=None)
-        told = [f"{len(told)} values" + ("" if largest is None else f", the largest {told[largest]}")]
+        told = [
+            f"{len(told)} values" + ("" if largest is None else f", the largest of those known alone {told[largest]}")
+        ]
     notes = [f"{g.text} does not show" for g in found.gauges]
     if found.silent:
         unseen = some([variables[i].name for i in found.silent])
@@ -306,7 +308,7 @@ def _gauge_text(names: Sequence[str], change: np.ndarray, units: Sequence[str], 
     if equal and len(set(units)) == 1 and len(set(np.sign(change))) == 1:
         return f"a common {'rotation' if units[0] == 'deg' else 'change'} of {listed}"
     if len(names) > 3 and len(set(np.sign(change))) == 1:
-        return f"a change of {listed} together, of some more than of others,"
+        return f"a common change of {listed}, by different amounts,"
     if logs:  # the one that changes most by a factor e
         steps = [f"{name} by a factor {math.exp(c):.3g}" for name, c in zip(names, change / size.max())]
     else:

@@ -74,8 +74,8 @@ class Refits:
 
     def foresee(self, sets: Sequence[Sequence[Variable]], say: Callable[[str, int, int], None]) -> None:
         """Chord steps of each set of variables, and the calibrations that these call for. All are held against the best
-        of the chord steps, and of what an earlier diagnosis has left, so that what is followed does not depend on how
-        many processes make them."""
+        of the chord steps that they compete with (`leader`), and of what an earlier diagnosis has left, so that what
+        is followed does not depend on how many processes make them."""
         if not self.by_chords():
             return
         wanted = [extra for extra in sets if self.curved(extra) < 2 and not self._begun(extra)]

@@ -5,16 +5,17 @@ Definition
 with x = ln(T_1/T_2)/2 of the transmittances along the axis and across it, whose mean is the sheet's `transmittance`; D
 is the diattenuation (T_1 - T_2)/(T_1 + T_2). The axis phi stands in n = (cos 2 phi, sin 2 phi): `dichroism_0` = x cos 2
 phi, `dichroism_45` = x sin 2 phi, against the sheet's own axes. Drawn and dyed polymers, tinted tape and wood are
-dichroic; a large x is a polarizer. Light meets the dichroism before the retardance.
+dichroic; a large x is a polarizer. Light meets the dichroism after a depolarization and before a retardance.
 Fingerprint
-    turned by itself before unpolarized light and one film, the sheet makes the signal swing twice per turn in first
-    order, where a retardance does nothing. Between crossed films it lets light through in second order, D^2/4 of what
-    passes the first one at 45 deg. It looks like a retardance where light is polarized and the sheet turns between two
-    films; and at rest behind the last film, like a polarized detector.
+    a sheet that is turned in unpolarized light, with one film before or behind it, makes the signal swing twice per
+    turn in first order, where a retardance does nothing. So it does between two films that are not crossed. Between
+    crossed films it lets light through in second order, at 45 deg D^2/4 of what passes the first film: turned there, it
+    looks exactly like a retardance. At rest behind the last film it looks like a polarized detector; at rest behind a
+    film, like a change of power or of that film's zero.
 Validity
-    weak absorption in one wavelength's length, the same at all wavelengths. A ray aslant sees the part of the in-plane
-    absorption that lies across it, over a longer path (optics.polarization.layers.Crossing.retardance). A sheet that
-    is not to make light needs a transmittance of 1/(1 + D) or less.
+    weak absorption over one wavelength of light, the same at all wavelengths. A ray aslant sees the part of the
+    in-plane absorption that lies across it, over a longer path (optics.polarization.layers.Crossing.retardance). A
+    sheet that is not to make light needs a transmittance of 1/(1 + D) or less.
 References
     Lu & Chipman, J. Opt. Soc. Am. A 13, 1106 (1996), eqs. (16)-(18); Goldstein, Polarized Light, 3rd ed., 5.2.
 """
@@ -89,14 +90,14 @@ effect = Effect(
     part="sheet",
     per="part",
     stages={"layer": absorb},
-    onset="tangent",
+    onset="both",
     parameters=tuple(
         Parameter(
             f"dichroism_{axis}",
             "1",
             0.0,
             (-2.0, 2.0),
-            f"half of ln(T_1/T_2) along {axis} deg of the sheet (less that across it)",
+            f"half of ln(T along / T across) of an axis at {axis} deg of the sheet",
             neutral=0.0,
             plausible=0.02,
             pair=f"dichroism_{45 - axis}",
@@ -105,7 +106,7 @@ effect = Effect(
         for axis in (0, 45)
     ),
     acts=("analyzer.angle", "sample.angle"),
-    needs="the sheet turned behind or before one film, or bare light beside it",
+    needs="the sheet turned before or behind one film; bare light beside it helps",
     checks=(check_transmittances, check_crossed_films, check_aslant, check_whole_dichroism),
     random=random,
 )

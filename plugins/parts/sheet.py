@@ -4,9 +4,10 @@ Definition
     M = t F                    transmittance t = transmittance exp(transmittance_slope (lambda - 540)/100)
     F = diattenuator(s, (1 - R_s)^2, (1 - R_p)^2)      both faces, Fresnel's R_s, R_p
 n = `index` is the sheet's index over that of what surrounds it: 1 in the middle of a skin of its own kind, 1.5 for a
-plate in air. What the sheet does to polarization besides are effects: `retardance`, `stress`, `depolarization`. With
-them it is a wave plate, a stressed plate, or a depolarizing foil; their axes turn with the sheet's `angle`. Angles
-count from the surface's x axis to its y axis: counterclockwise for a viewer at whom the surface's normal points.
+plate in air. What the sheet does to polarization besides are effects: `retardance`, `stress`, `dichroism`,
+`depolarization`. With them it is a wave plate, a stressed plate, a tinted drawn foil, or a depolarizing one; their axes
+turn with the sheet's `angle`. Angles count from the surface's x axis to its y axis: counterclockwise for a viewer at
+whom the surface's normal points.
 A sheet that covers a part of the view alone has a map, `region_map` (optics.scene.regions): it acts where the map has
 the number `region` and does nothing elsewhere, so that one photograph shows the sample beside bare light. The map stays
 where it is when the sheet turns. Two sheets with one map and two numbers are two samples.

@@ -172,7 +172,7 @@ def test_gains_that_change_together_are_told_without_their_factors():
     names, change = [f"camera.gain[{i}]" for i in range(5)], np.array([1.0, 0.7, 0.68, 0.9, 1.0])
     told = gauges._gauge_text(names, change, ["1"] * 5, logs=True)
     assert told == (
-        "a change of camera.gain[0], camera.gain[1], camera.gain[2] and 2 more together, of some more than of others,"
+        "a common change of camera.gain[0], camera.gain[1], camera.gain[2] and 2 more, by different amounts,"
     )
     opposed = gauges._gauge_text(names, change * [1, -1, 1, 1, 1], ["1"] * 5, logs=True)
     assert opposed.startswith("a change of camera.gain[0] by a factor 2.72 with camera.gain[1] by a factor 0.497")

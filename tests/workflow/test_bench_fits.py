@@ -162,6 +162,26 @@ def test_a_refit_finds_the_order_of_an_effect(mitsuba, tmp_path):
     assert np.hypot(*found.estimate[-2:]) == pytest.approx(420.0, abs=1.0)
 
 
+def test_a_dichroic_sheet_between_crossed_films_is_not_called_a_plate(mitsuba, tmp_path):
+    """There it has no first order and is the image of a retardance: it is named too."""
+    angles = np.r_[ANGLES[:18], ANGLES[:2]]
+    settings = {"sample.angle": angles, "analyzer.angle": np.r_[np.full(18, 90.0), 0.0, 0.0]}
+    c = np.sqrt(1 - np.tanh(0.3) ** 2)
+    a, b = np.radians(settings["analyzer.angle"]), np.radians(angles)
+    along, across = np.cos(2 * b), np.sin(2 * b)  # ideal films, the first at 0 deg, and the Mueller matrix by hand
+    d = np.tanh(0.3)
+    q, u = d * along + along**2 + c * across**2, d * across + (1 - c) * along * across
+    light = 3.0 * (1 + d * along + np.cos(2 * a) * q + np.sin(2 * a) * u) / 4
+    folder = written(tmp_path / "set", settings, light)
+    text = (folder / "captures.toml").read_text()
+    (folder / "captures.toml").write_text(text + '[exclude]\n"stress birefringence" = "no load"\n')
+    record, model, found = loop.begin(studies.Setup(captures=str(folder), free=["source.power"]), tmp_path / "study")
+    result = loop.examine(
+        record, model, studies.Setup(captures=str(folder), free=["source.power"]), found, advised=False
+    )
+    assert "dichroism" in result.ambiguous or result.missing == "dichroism", result.sentence
+
+
 # -- what an effect frees --------------------------------------------------------------------------------------------
 def names_of(model, effect, held=()):
     return [v.name for v in studies.effect_variables(model, model.scene.registry.find_effect(effect), held)]

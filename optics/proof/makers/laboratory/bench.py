@@ -7,6 +7,7 @@ of a part's axis a Stokes vector (I, Q, U, V) becomes
 
     film       (a I + b Q, b I + a Q, c U, c V)      a, b = (T1 +- T2)/2, c = sqrt(T1 T2)
     plate      (I, Q, U cos d + V sin d, V cos d - U sin d)         fast axis, phase d
+    dichroic   (I + D Q, Q + D I, c U, c V)          absorbed less along its axis, D = tanh x, c = sqrt(1 - D^2)
     haze       (I, (1 - h) Q, (1 - h) U, (1 - h) V)
 
 Source: Collett, Field Guide to Polarization, 2005: Mueller matrices of a polarizer, a wave plate, a depolarizer.
@@ -57,7 +58,8 @@ PLAIN: dict[str, float] = {
     # lamp: linear polarization; relative per minute; relative at the end of a warm-up; a step at half time
     **dict.fromkeys(("lamp_q", "lamp_u", "drift", "warm_up", "lamp_step"), 0.0),
     **{f"{film}_{name}": value for film in FILMS for name, value in FILM.items()},
-    # sample: deg at 540 nm along 0 and 45 deg; Cauchy's; deg from face to face; haze; absorption along 0 and 45 deg
+    # sample: deg at 540 nm along 0 and 45 deg; Cauchy's; deg from face to face; haze; half of the logarithm of
+    # the transmittance along over that across an axis, at 0 and at 45 deg
     **dict.fromkeys(("plate_0", "plate_45", "dispersion", "twist", "haze", "dichroic_q", "dichroic_u"), 0.0),
     # detector: its own polarization, in all light and the more the brighter it is; how much a reading tires it
     **dict.fromkeys(("detector_q", "detector_u", "detector_bright_q", "detector_bright_u", "fatigue"), 0.0),
@@ -202,6 +204,7 @@ def _sample(b: Bench, light: np.ndarray, settings: Settings, wavelengths: np.nda
             light,
         )
     turn = _column(settings, "sample.angle", len(light))
+    light = light * np.array([1.0, *[1 - b["haze"]] * 3])
     if b["dichroic_q"] or b["dichroic_u"]:
         i, q, u, v = np.moveaxis(_turned(light, turn), -1, 0)
         x = np.hypot(b["dichroic_q"], b["dichroic_u"])  # half of the logarithm of the ratio of the transmittances
@@ -224,7 +227,7 @@ def _sample(b: Bench, light: np.ndarray, settings: Settings, wavelengths: np.nda
             c, s = np.cos(np.radians(phase / layers)), np.sin(np.radians(phase / layers))
             i, q, u, v = np.moveaxis(_turned(light, angle), -1, 0)
             light = _turned(np.stack([i, q, c * u + s * v, c * v - s * u], -1), -angle)
-    return light * np.array([1.0, *[1 - b["haze"]] * 3])
+    return light
 
 
 def _meter(b: Bench, signal: np.ndarray, settings: Settings, count: int, full: float) -> np.ndarray:
