@@ -701,10 +701,11 @@ def compare(found, reference, image, step, tolerance, keep=True, what=""):
     )
 
 
-def without_flips(bench, found, reference, keep):
+def without_flips(bench, key, found, reference, keep):
     """The pixels kept, in a scene of beads without one in a thousand: of their thousands of shadows' edges one may pass
-    a sample between the values at which rims are looked for."""
-    if not getattr(bench.renderer, "crowded", False):
+    a sample between the values at which rims are looked for. So may, of a board that carries all LEDs, the edge of a
+    shadow that is smaller than a pixel, which no rim tells of."""
+    if not getattr(bench.renderer, "crowded", False) and bench.renderer.kind(key) != "board":
         return keep
     off = np.abs(found - reference).max(-1)
     return keep & (off <= np.quantile(off[np.broadcast_to(keep, off.shape)], 0.999))
@@ -727,7 +728,7 @@ def check_forward_mode(bench, key):
         # percent
         tolerance = 2e-3 if moves(bench, key) else 5e-4
         found = r.led_tangent(now, led, key)
-        keep = without_flips(bench, found, reference, keep)
+        keep = without_flips(bench, key, found, reference, keep)
         compare(found, reference, r.image(now, led), step, tolerance, keep, f"{key} = {value:g}")
 
 
@@ -802,7 +803,7 @@ def check_model_derivative(bench, key, tolerance, rims=False):
             min(max(value + s * p.step * p.plausible, p.bounds[0]), p.bounds[1]) for s in (-1, 1)
         ]  # the model's own steps
         keep = calm(bench, key, [value, *used, *own], base) if moves(bench, key) else True
-        keep = without_flips(bench, found, reference, keep)
+        keep = without_flips(bench, key, found, reference, keep)
         compare(found, reference, bench.image({**base, key: value}), step, tolerance, keep, f"{key} = {value:g}")
         if rims:
             check_rim(found, reference, ~keep, key)
