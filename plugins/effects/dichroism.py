@@ -1,7 +1,8 @@
 """Dichroism: a sheet absorbs one linear polarization more than the one across it.
 
 Definition
-    M = [[1, D n'], [D n, c + (1 - c) n n']],  circular light keeps c        D = tanh x,  c = sqrt(1 - D^2)
+    M = [[1, D n'], [D n, c + (1 - c) n n']] of linear light;  circular light keeps c
+    D = tanh x,  c = sqrt(1 - D^2)
 with x = ln(T_1/T_2)/2 of the transmittances along the axis and across it, whose mean is the sheet's `transmittance`; D
 is the diattenuation (T_1 - T_2)/(T_1 + T_2). The axis phi stands in n = (cos 2 phi, sin 2 phi): `dichroism_0` = x cos 2
 phi, `dichroism_45` = x sin 2 phi, against the sheet's own axes. Drawn and dyed polymers, tinted tape and wood are
