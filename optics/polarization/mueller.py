@@ -14,6 +14,7 @@ matrix must meet to be physical, Cloude, Proc. SPIE 1166, 177 (1989)."""
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Sequence
 
@@ -177,6 +178,13 @@ def absorber(t) -> Mueller:
 def rotation(q, u) -> Mueller:
     """Stokes vector in axes turned by phi (from x to y): S1' = q S1 + u S2, S2' = q S2 - u S1."""
     return Mueller([[1.0, 0, 0, 0], [0, q, u, 0], [0, -u, q, 0], [0, 0, 0, 1.0]])
+
+
+def turned(a, b, angle) -> tuple:
+    """(a, b) = size (cos 2 phi, sin 2 phi) of something with an axis at phi, such as a retardance, after a turn of the
+    axis by `angle` (deg)."""
+    double = 2 * angle * (math.pi / 180)
+    return a * cos(double) - b * sin(double), a * sin(double) + b * cos(double)
 
 
 def diattenuator(q, u, t1, t2) -> Mueller:

@@ -25,16 +25,14 @@ import math
 
 import numpy as np
 
-from optics.polarization.mueller import cos, dichroic, sin
+from optics.polarization.mueller import dichroic, turned
 from optics.scene.checking import agree, mueller, ray
 from optics.scene.declare import Effect
 from optics.scene.parameter import Parameter
 
 
 def absorb(crossing, sheet):
-    turn = 2 * sheet.angle * (math.pi / 180)
-    a = sheet.dichroism_0 * cos(turn) - sheet.dichroism_45 * sin(turn)
-    b = sheet.dichroism_0 * sin(turn) + sheet.dichroism_45 * cos(turn)
+    a, b = turned(sheet.dichroism_0, sheet.dichroism_45, sheet.angle)
     return dichroic(*crossing.retardance(a, b, sheet.index))
 
 

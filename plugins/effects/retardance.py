@@ -23,7 +23,7 @@ import math
 
 import numpy as np
 
-from optics.polarization.mueller import cos, retarder, sin, twisted_retarder
+from optics.polarization.mueller import retarder, turned, twisted_retarder
 from optics.scene.checking import agree, mueller, ray
 from optics.scene.declare import Effect
 from optics.scene.parameter import Parameter
@@ -33,9 +33,7 @@ ORDERS = (30.0, *(90.0 * k for k in range(1, 9)))
 
 
 def retard(crossing, sheet):
-    turn = 2 * sheet.angle * (math.pi / 180)
-    a = sheet.retard_0 * cos(turn) - sheet.retard_45 * sin(turn)
-    b = sheet.retard_0 * sin(turn) + sheet.retard_45 * cos(turn)
+    a, b = turned(sheet.retard_0, sheet.retard_45, sheet.angle)
     ratio = 540.0 / crossing.wavelengths
     radians = (math.pi / 180) * ratio * (1 + sheet.retard_dispersion * (ratio * ratio - 1))
     a, b = (c * radians for c in crossing.retardance(a, b, sheet.index))
