@@ -90,8 +90,10 @@ class Refits:
 
     def _calibrate_ahead(self, sets: Sequence[Sequence[Variable]], say: Callable[[str, int, int], None]) -> None:
         """The calibrations that chord steps call for, several at once where processes share them."""
-        open_ = [extra for extra in sets if self.unfinished(extra)]
-        jobs = [partial(_tried, make=partial(_calibrated, **self._calibrated_of(extra))) for extra in open_]
+        leaders = {own: self.leader(own) for own in set(map(_per_frame, sets))}
+        open_ = [extra for extra in sets if self.unfinished(self.chord(extra), leaders[_per_frame(extra)])]
+        made_of = [self._calibrated_of(extra, leaders[_per_frame(extra)]) for extra in open_]
+        jobs = [partial(_tried, make=partial(_calibrated, **own)) for own in made_of]
         if jobs:
             say("calibrations", 0, len(jobs))
         for n, (k, found) in enumerate(self.model.each(self.base.frames, jobs), 1):
@@ -157,28 +159,29 @@ class Refits:
         steps = {v.name: self.steps[v.name] for v in extra if v.name in self.steps}
         return {"base": self.base, "extra": extra, "secant": steps, "seed": self.setup.seed, "negligible": self.coarse}
 
-    def leader(self, extra: Sequence[Variable]) -> float:
-        """The best fall so far of what these variables compete with.
+    def leader(self, per_frame: bool) -> float:
+        """The best fall so far; without strengths per frame, the best of the laws that all frames share.
 
-        A strength per frame takes up whatever wanders from frame to frame, which is no reason to leave laws that all
-        frames share unfinished: those are held against each other."""
+        A strength per frame takes up whatever wanders from frame to frame, which is no reason to leave laws of all
+        frames unfinished: those are held against each other."""
         fits = (*self.chords.values(), *self.results.values())
-        alike = [fit for fit in fits if _per_frame(extra) or not _per_frame(self._extra_of(fit))]
-        return max(map(self.fall, alike))
+        return max(self.fall(fit) for fit in fits if per_frame or not _per_frame(self._extra_of(fit)))
 
-    def unfinished(self, extra: Sequence[Variable]) -> bool:
+    def unfinished(self, quick: Fit, leader: float) -> bool:
         """Whether chord steps have no end but come near the best, or were promised to."""
-        quick = self.chord(extra)
         ended = quick.converged and self.fall(quick) > AS_PROMISED * quick.promised
-        return not ended and max(self.fall(quick), quick.promised) > PROMISING * self.leader(extra)
+        return not ended and max(self.fall(quick), quick.promised) > PROMISING * leader
 
     def calibrated(self, extra: Sequence[Variable]) -> Fit:
         """The fit by chord steps, or the calibration that these call for."""
-        return _calibrated(self.model, **self._calibrated_of(extra)) if self.unfinished(extra) else self.chord(extra)
+        quick, leader = self.chord(extra), self.leader(_per_frame(extra))
+        return (
+            _calibrated(self.model, **self._calibrated_of(extra, leader)) if self.unfinished(quick, leader) else quick
+        )
 
-    def _calibrated_of(self, extra: Sequence[Variable]) -> dict[str, Any]:
+    def _calibrated_of(self, extra: Sequence[Variable], leader: float) -> dict[str, Any]:
         """What `_calibrated` needs beside the model."""
-        quick, before, near = self.chord(extra), self.minimised(self.base), PROMISING * self.leader(extra)
+        quick, before, near = self.chord(extra), self.minimised(self.base), PROMISING * leader
         return {
             "quick": quick,
             "enough": before - AS_PROMISED * quick.promised,

@@ -103,8 +103,8 @@ def test_a_strength_per_frame_leaves_no_law_of_all_frames_unfinished(frames, unf
     base.normal = object()
     refits = Refits(SimpleNamespace(captures=SimpleNamespace(table=None)), Setup("captures"), base, [])
     refits.chords = {("g",): fit([known, best], 420.0, promised=580.0), ("b",): fit([known, bent], 940.0, False, 270.0)}
-    assert refits.unfinished([bent]) is unfinished
-    assert not refits.unfinished([best])
+    assert refits.unfinished(refits.chord([bent]), refits.leader(per_frame=False)) is unfinished
+    assert not refits.unfinished(refits.chord([best]), refits.leader(per_frame=frames is not None))
 
 
 def test_a_refit_is_taken_up_again(tmp_path, monkeypatch):
