@@ -14,7 +14,8 @@ where that is more; of readings, each explanation may have noise that neighbours
 (`optics.diagnosis.correlation`): a lamp that wanders is a rival of whatever changes slowly.
 
 Whether an explanation needs an effect that a simpler one lacks is a question of significance: family-wise; of images,
-with the design effect of what tells the two apart (`optics.diagnosis.homogeneity.variances`). Of two that are not
+with the design effect of what tells the two apart (`optics.diagnosis.homogeneity.variances`), by which the price of a
+lamp that wanders is not divided: frames tell it, not pixels. Of two that are not
 nested, one is told apart from the best when its score is TOLD lower (CLEAR, where plausibility alone decides; an effect
 is claimed when every explanation without it is SURE lower, and NO_TIE where plausibility alone decides, and when it
 adds more to the fall than its strengths' distance from neutral costs: chance brings a significant fall by strengths

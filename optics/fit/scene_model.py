@@ -486,8 +486,8 @@ class SceneModel:
                 image = self._secant(values, variable, index, secant[variable.name], prediction, seed, at_once)
             elif variable.name in at_once:
                 image = linear.of_image(at_once[variable.name])
-                if self.developer.camera.clock in acts:
-                    image = image + linear.of_parameter((self.developer.camera.clock,))
+                if camera := self._shown_by_camera(acts):
+                    image = image + linear.of_parameter(camera)
             else:
                 with self.renderer.splitting(self._side(now)):
                     image = self._tangent(linear, now, acts, seed)
@@ -608,11 +608,9 @@ class SceneModel:
         self, linear, now: Mapping, acts: Mapping[str, float], seed: int, at_rest: bool = False
     ) -> np.ndarray | None:
         """d DN / d value in a frame for keys that share one value; None where nothing depends on them."""
-        own = {k for k in acts if self.parameters[k].how == "image"}
-        camera = tuple(k for k in acts if k in own or k == self.developer.camera.clock)
-        light = None
+        camera, light = self._shown_by_camera(acts), None
         for key, factor in acts.items():
-            if key in own:
+            if self.parameters[key].how == "image":
                 continue
             change = self._light_tangent(now, key, factor, seed, at_rest)
             if change is not None:
@@ -621,6 +619,10 @@ class SceneModel:
         if camera:
             total = linear.of_parameter(camera) + (0 if total is None else total)
         return total
+
+    def _shown_by_camera(self, keys: Iterable[str]) -> tuple[str, ...]:
+        """Those that act in the camera: its own parameters of images, and the clock by which its dark signal drifts."""
+        return tuple(k for k in keys if self.parameters[k].how == "image" or k == self.developer.camera.clock)
 
     def _light_tangent(self, now: Mapping, key: str, factor: Any, seed: int, at_rest: bool) -> np.ndarray | None:
         """factor times d radiance / d key in a frame; of Stokes vectors, as `radiance` has them."""

@@ -168,7 +168,7 @@ def test_dials_that_never_turned_and_films_on_the_table_are_not_freed():
 
 
 def test_gains_that_change_together_are_told_without_their_factors():
-    """Eleven gains of which dark frames hardly know any, beside a power that they make up for."""
+    """Five gains of which dark frames hardly know any, beside a power that they make up for."""
     names, change = [f"camera.gain[{i}]" for i in range(5)], np.array([1.0, 0.7, 0.68, 0.9, 1.0])
     told = gauges._gauge_text(names, change, ["1"] * 5, logs=True)
     assert told == (

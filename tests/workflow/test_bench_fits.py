@@ -175,10 +175,9 @@ def test_a_dichroic_sheet_between_crossed_films_is_not_called_a_plate(mitsuba, t
     folder = written(tmp_path / "set", settings, light)
     text = (folder / "captures.toml").read_text()
     (folder / "captures.toml").write_text(text + '[exclude]\n"stress birefringence" = "no load"\n')
-    record, model, found = loop.begin(studies.Setup(captures=str(folder), free=["source.power"]), tmp_path / "study")
-    result = loop.examine(
-        record, model, studies.Setup(captures=str(folder), free=["source.power"]), found, advised=False
-    )
+    setup = studies.Setup(captures=str(folder), free=["source.power"])
+    record, model, found = loop.begin(setup, tmp_path / "study")
+    result = loop.examine(record, model, setup, found, advised=False)
     assert "dichroism" in result.ambiguous or result.missing == "dichroism", result.sentence
 
 
