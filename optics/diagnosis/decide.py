@@ -30,6 +30,7 @@ from optics.words import p_text, percent
 
 MANY = 3  # effects of one explanation
 DIALS = "dials known"  # of an effect with a strength per frame
+LIGHT = "light"
 RIVALS = "rivals calibrated"  # of pairs of effects of images, which are dear
 LAW = "no other law"  # of an effect that the model has already
 CLUTTER = "beyond clutter"  # of the strength, which parts of the data tell
@@ -81,6 +82,7 @@ class Findings:
                  none that is significant; law_lead: of the best explanation's score over that law's
     fragile      an effect that other weights or masks prefer clearly, '' for none
     untried      explanations without the winner that may do better by their scores, and were not refitted, in words
+    run_away     a power that has run away from the others, in words (optics.fit.run_away)
     measured     whether repeats fix the size of the noise
     misstated    whether the excess is that of images whose noise is stated a little too small: without structure
     """
@@ -131,6 +133,7 @@ class Findings:
     adds: float = math.inf
     priced: float = 0.0
     untried: Sequence[str] = ()
+    run_away: str = ""
     measured: bool = False
     misstated: bool = False
 
@@ -217,7 +220,7 @@ def _word_of_winner(f: Findings, failed: set[str]) -> str:
         # strength scatters as much between parts of the data, or is too far from neutral for what it explains; or
         # frames that took no part do not know of it.
         return "NOTHING"
-    bars = {"share", CLUTTER, "near"}  # what is no tie between causes
+    bars = {"share", CLUTTER, "near", LIGHT}  # what is no tie between causes
     if not f.shared:  # where it is, noise is one of those that tie: that an effect gains little over it is no bar
         bars.add("significant")
     if f.curve_lead > TOLD:
@@ -325,6 +328,13 @@ def _against_causes_outside(f: Findings) -> list[Condition]:
             DIALS,
             f"errors of {f.unset}, which captures do not state, act on every frame too: give them under [uncertainty]",
             "no error of a dial that nobody states acts as it does",
+        ),
+        _unless(
+            f.run_away,
+            LIGHT,
+            f"{f.run_away}: the model calls that light dark in every frame, and what leads there may lead nowhere "
+            "else. Say about how strong it is by a prior on its power (--prior)",
+            "no power stands apart from the others",
         ),
         Condition(
             "share",

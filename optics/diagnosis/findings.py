@@ -23,6 +23,7 @@ from optics.diagnosis.thresholds import AS_GOOD, DETAIL, HIDDEN, LEVEL, MAIN, MI
 from optics.fit.compare import led_label
 from optics.fit.model import Model, value_of
 from optics.fit.result import Fit
+from optics.fit.run_away import powers_apart
 from optics.fit.scene_model import SceneModel
 from optics.scene.parameter import Variable
 
@@ -226,6 +227,7 @@ def _of_subject(
         carried_by=carried_by,
         fragile=table.fragile(name, outcome.named),
         untried=[" with ".join(sorted(names)) for names in outcome.untried if name not in names],
+        run_away=powers_apart(case.model, best.fit),
     )
 
 

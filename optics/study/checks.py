@@ -14,6 +14,7 @@ from optics.diagnosis.thresholds import FAR
 from optics.fit.compare import Row
 from optics.fit.model import value_of
 from optics.fit.result import Fit
+from optics.fit.run_away import powers_apart
 from optics.fit.scene_model import SceneModel
 from optics.fit.tempering import weight_of
 from optics.scene.parameter import Values
@@ -74,6 +75,11 @@ def after_calibration(model: SceneModel, found: Fit, level: Row | None) -> list[
             "near them until the missing effect is found"
         )
     texts += _far_lights(model, found)
+    if apart := powers_apart(model, found):
+        texts.append(
+            f"{apart}: the model calls that light dark in every frame, so that its power explains what is missing. "
+            "Where lamps are known to be more alike, say so by a prior on the power (--prior)"
+        )
     known = [(v, value_of(model, found.values, v), v.prior) for v in found.variables if v.prior is not None]
     moved = [(v, value, prior) for v, value, prior in known if abs(value - prior[0]) > SURPRISING * prior[1]]
     if moved:

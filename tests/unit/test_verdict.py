@@ -436,6 +436,8 @@ GOOD = Findings(
         ({"law": "b along frame", "law_lead": SURE + 0.1}, "CLAIM"),
         ({"law": "b along frame", "law_lead": SURE - 0.1}, "AMBIGUOUS"),  # as over any other rival
         ({"unset": "analyzer.angle"}, "AMBIGUOUS"),  # a gain of each frame, or a dial that was off in each
+        ({"run_away": "source.power_r 4e+04"}, "CANNOT_TELL"),  # in a light that no lamp sends
+        ({"run_away": "source.power_r 4e+04", "common": False, "survivors": 2}, "CANNOT_TELL"),
         ({"adds": 13.0, "priced": 20.4, "structure_p": 0.5, "excess_sd": 1.0}, "NOTHING"),  # a glare of 42 sizes
         ({"adds": 13.0, "priced": 20.4}, "CANNOT_TELL"),
         ({"adds": 13.0, "priced": 12.0, "structure_p": 0.5, "excess_sd": 1.0}, "CLAIM"),

@@ -1,0 +1,28 @@
+"""Powers that have run away.
+
+A band that the model calls dark in every frame, as it is between crossed films, takes whatever light there is for its
+own: its power grows thousands of times until a last trace of the transmission explains that light. What is ranked from
+there is ranked in a light that no lamp sends."""
+
+from __future__ import annotations
+
+from optics.fit.model import Model
+from optics.fit.result import Fit
+
+# times the least of the others: bands of one lamp, or lamps of one kind, differ by ten, and powers that ran away by 800
+APART = 100.0
+KNOWN = 0.1  # relative sd of a power that the images tell; that of a lamp that is off says nothing
+
+
+def powers_apart(model: Model, found: Fit) -> str:
+    """'source.power_r 4e+04, 8e+03 times source.power_b', of the largest power that no prior holds; '' where none
+    stands apart from the others."""
+    powers = [
+        (float(value), v)
+        for v, value, sd in zip(found.variables, found.estimate, found.sd)
+        if v.frames is None and v.prior is None and model.linear_in(v) and 0 <= sd < KNOWN * value
+    ]
+    if len(powers) < 2:
+        return ""
+    (least, other), (most, v) = min(powers, key=lambda p: p[0]), max(powers, key=lambda p: p[0])
+    return f"{v.name} {most:.3g}, {most / least:.2g} times {other.name}" if most > APART * least else ""
