@@ -16,13 +16,18 @@ KNOWN = 0.1  # relative sd of a power that the images tell; that of a lamp that 
 
 def powers_apart(model: Model, found: Fit) -> str:
     """'source.power_r 4e+04, 8e+03 times source.power_b', of the largest power that no prior holds; '' where none
-    stands apart from the others."""
+    stands apart from the others.
+
+    A red lamp has little blue, of which as much would come through: so much power changes as much light. What has run
+    away changes little, and its error is as many times that of the others."""
     powers = [
-        (float(value), v)
+        (float(value), float(sd), v)
         for v, value, sd in zip(found.variables, found.estimate, found.sd)
         if v.frames is None and v.prior is None and model.linear_in(v) and 0 <= sd < KNOWN * value
     ]
     if len(powers) < 2:
         return ""
-    (least, other), (most, v) = min(powers, key=lambda p: p[0]), max(powers, key=lambda p: p[0])
-    return f"{v.name} {most:.3g}, {most / least:.2g} times {other.name}" if most > APART * least else ""
+    least, well, other = min(powers, key=lambda p: p[0])
+    most, badly, v = max(powers, key=lambda p: p[0])
+    apart = most > APART * least and badly > APART * well
+    return f"{v.name} {most:.3g}, {most / least:.2g} times {other.name}" if apart else ""
