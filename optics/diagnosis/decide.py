@@ -56,7 +56,8 @@ class Findings:
                  explanation, in words; '' for none
     adds         what the winner adds to the fall of the others, beside noise that neighbours share; priced: what its
                  strengths cost for being far from neutral (`optics.diagnosis.explanations`)
-    ratio        the best curve's fall, less its cost, over that of the best explanation; coordinate: of that curve
+    ratio        the best curve's fall, less its cost, over that of the best explanation; coordinate: of that curve;
+                 beside: whether noise that neighbouring readings or frames share was allowed for in both
     rival        whether a curve does significantly better, by RIVAL (a map) or RIVAL_CURVE, where misfit is left, or is
                  not told apart from several effects; curve_lead: of its score over that of the best explanation,
                  0 where that leaves nothing
@@ -102,6 +103,7 @@ class Findings:
     needed: float = TOLD
     against: str = ""
     ratio: float = 0.0
+    beside: bool = False
     rival: bool = False
     curve_lead: float = math.inf
     coordinate: str = ""

@@ -111,7 +111,7 @@ def findings_of(
     complete = bool(leader.members) and leader.complete
     fall = leader.fall - leader.expectation if subject else own.fall
     session = case.session if case.evidence.is_table else case.lamp
-    if session is not None and not leader.by_frame:
+    if beside := session is not None and not leader.by_frame:
         scale = outcome.scale
         fingerprints = prints.beside_shared_noise(
             case.model, case.evidence, case.places or [], fingerprints, session, scale
@@ -138,6 +138,7 @@ def findings_of(
     return replace(
         own,
         ratio=best_curve.net / max(fall, 1.0),
+        beside=beside,
         rival=bool(better),
         curve_lead=math.inf if curve else 0.0 if complete else lead,
         coordinate=best_curve.coordinate,

@@ -343,6 +343,8 @@ def _partial(f: Findings, winner: Row, failing: Sequence[Condition]) -> str:
 
 def _unknown(f: Findings, curve: Fingerprint, basis: Basis) -> str:
     best = f"{f.ratio:.3g} times as much as the best effect" if f.winner else "what no effect does"
+    if f.winner and f.beside:
+        best += ", of what noise that neighbours share leaves to explain"
     i = int(np.argmax(np.abs(curve.curve)))
     size = percent(curve.curve[i]) if curve.kind == "gain" else f"{curve.curve[i]:.2g} DN"
     where = curve.labels[i] if curve.labels else f"{curve.coordinate} {curve.centres[i]:.3g}{spaced(curve.unit)}"
