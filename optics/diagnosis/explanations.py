@@ -809,10 +809,27 @@ def compete(case: Case, trials: list[Trial]) -> Outcome:
     leader = next((t for t in order if t.members), order[0])
     outcome = Outcome(leader, leader, [leader], order, scale, correlation)
     outcome.wander = wander_of(case, outcome, outcome.base)
+    if (instead := _lamp_or_gains(case, outcome)) is not None:
+        outcome.leader = outcome.best = leader = instead
+        outcome.survivors = [leader]
     for t in order:
         if t is not leader:
             outcome.leads[t.names] = _lead(case, outcome, leader, t)
     return _with_survivors(case, outcome)
+
+
+def _lamp_or_gains(case: Case, outcome: Outcome) -> Trial | None:
+    """Of images, the explanation by a gain of each frame that leads in place of effects which explain nothing beside a
+    lamp that wanders: that lamp is what the gains are, and no rival of theirs."""
+    leader = outcome.leader
+    if case.evidence.is_table or not leader.members or leader.by_frame or _adds_to_noise(leader, outcome.base):
+        return None
+    for t in outcome.trials:
+        if t.by_frame and t.members:
+            lead, needed = _lead(case, outcome, t, leader)
+            if lead > needed:
+                return t
+    return None
 
 
 def beside_refuted(case: Case, outcome: Outcome, refuted: Sequence[Trial], why: str) -> Outcome:

@@ -239,6 +239,27 @@ def test_what_leaves_an_unnoticed_lamp_is_a_rival_of_gains_of_each_frame(monkeyp
     assert (lead > needed) is ruled_out
 
 
+@pytest.mark.parametrize("brings, instead", [(2.0, True), (400.0, False)])
+def test_gains_of_each_frame_lead_in_place_of_what_explains_nothing_beside_a_lamp(monkeypatch, brings, instead):
+    """Where a lamp that wanders explains all, what leads beside it is the cheapest effect, a tone curve that brings 2 of
+    chi2: the gains, which cost more than that lamp, are the same and lead in its place. A tone curve that is there
+    leads as it did."""
+
+    def trial(name, deviance, gain, by_frame):
+        own = {"members": [SimpleNamespace(cone=SimpleNamespace(live=[0]))], "keys": {name}, "by_frame": by_frame}
+        own |= {"deviance": deviance, "gain": gain, "fall": 3e5, "price": 0.0, "complete": True, "bare": True}
+        return SimpleNamespace(**own, cost=150.0 if by_frame else 13.0, fit=SimpleNamespace(values=0.0))
+
+    gains, curve = trial("gains", 1000.0, 0.0, True), trial("curve", 1110.0, 3e5, False)
+    evidence = SimpleNamespace(is_table=False)
+    case = SimpleNamespace(lamp=None, evidence=evidence, prior_chi2=lambda values: 0.0, known_chi2=lambda values: 0.0)
+    monkeypatch.setattr(explanations, "design_effect", lambda *a: 1.0)
+    base = SimpleNamespace(deviance=1110.0 + brings, members=[], by_frame=False)
+    outcome = SimpleNamespace(scale=1.0, base=base, leader=curve, trials=[base, curve, gains])
+    found = explanations._lamp_or_gains(case, outcome)
+    assert found is (gains if instead else None)
+
+
 def test_misfit_that_is_left_beside_gains_of_each_frame_is_counted_without_a_lamp(monkeypatch):
     """Gains of each frame bring 2900 and leave 320, as of noise that is stated too small. Without them a lamp that
     swings makes up for all but 70: that lamp is those gains, and the 70 are no measure of what they bring."""
