@@ -2,14 +2,14 @@
 
 Definition
     var S = K (S - b) + q^2/12                                   photon transfer, as in `optics.captures.noise`
-    D = I_1/S_1 - I_2/S_2                                        two pictures of one scene under two lights
+    D = I_1/S_1 - I_2/S_2                                        two images of one scene under two lights
     E (L D)^2 = sum over both of (K (S - b) + q^2/12)/S^2 + t^2 + (p b)^2 (1/S_1 - 1/S_2)^2
 with the images I, their smooth level S, DN, the step q between values, and the Laplacian L, whose squared weights add
-up to 1. A pattern p of the scene's own is in both pictures: D has left of it what the black level makes of it, and t
+up to 1. A pattern p of the scene's own is in both images: D has left of it what the black level makes of it, and t
 what the lights do. All but q come of least squares over groups of pixels of about the same S_1 and S_2; of the squares
 in a group their median is taken, which dust and edges do not move.
 Validity
-    linear pictures that no lossy format and no smoothing has passed. Dark noise of r DN is not told from b: the level
+    linear images that no lossy format and no smoothing has passed. Dark noise of r DN is not told from b: the level
     that is found is b - r^2/K. A curve that is bent downwards, as of a camera that codes for viewing, ends below 0 and
     says nothing.
 References
@@ -29,7 +29,7 @@ from scipy.optimize import nnls
 
 SMOOTH = 5  # px, side of the squares over which the level is a mean
 LAPLACIAN = np.outer([1, -2, 1], [1, -2, 1]) / 6
-MIDDLE = 1200  # px, side of the middle of a picture that is looked at: a million pixels tell enough
+MIDDLE = 1200  # px, side of the middle of an image that is looked at: a million pixels tell enough
 LEVELS, ENOUGH = 16, 100  # groups along each level, and the pixels that one has at least
 WIDE = 1.5  # times the lowest level that the highest is at least: a line over less says nothing of where it ends
 OF_GAUSSIAN = 0.4549  # median of a squared Gaussian of variance 1
@@ -38,9 +38,9 @@ CERTAIN = 3.0  # standard deviations above 0 of a black level that is believed
 
 @dataclass(frozen=True)
 class PhotonNoise:
-    """What the noise of pictures says of their camera.
+    """What the noise of images says of their camera.
 
-    black_level   DN: the mean of what pairs of pictures say, weighted by their errors
+    black_level   DN: the mean of what pairs of images say, weighted by their errors
     sd            DN: how far they scatter, which is more than the error of their mean: some of it they share
     system_gain   DN of variance per DN"""
 
@@ -50,11 +50,11 @@ class PhotonNoise:
 
 
 def photon_noise(scenes: Sequence[Sequence[np.ndarray]], saturation: float, step: float = 1.0) -> PhotonNoise | None:
-    """What the noise says of pictures (H, W) in DN, some of each scene, each under a light of its own; None where they
+    """What the noise says of images (H, W) in DN, some of each scene, each under a light of its own; None where they
     do not determine a black level above 0."""
     found = []
-    for pictures in scenes:
-        parts = [_middle(p) for p in pictures]
+    for images in scenes:
+        parts = [_middle(p) for p in images]
         smooth = [_level(p) for p in parts]
         count = len(parts)
         for i in range(count if count > 2 else count - 1):
@@ -70,20 +70,20 @@ def photon_noise(scenes: Sequence[Sequence[np.ndarray]], saturation: float, step
     return PhotonNoise(float(level), sd, float(gain)) if level > CERTAIN * sd else None
 
 
-def _middle(picture: np.ndarray) -> np.ndarray:
-    top, left = (max(n - MIDDLE, 0) // 2 for n in picture.shape)
-    return np.asarray(picture[top : top + MIDDLE, left : left + MIDDLE], np.float64)
+def _middle(image: np.ndarray) -> np.ndarray:
+    top, left = (max(n - MIDDLE, 0) // 2 for n in image.shape)
+    return np.asarray(image[top : top + MIDDLE, left : left + MIDDLE], np.float64)
 
 
-def _level(picture: np.ndarray) -> np.ndarray:
+def _level(image: np.ndarray) -> np.ndarray:
     """A mean over squares, and what such a mean takes from it: twice smoothed, a dark hollow is as dark as it is, and
     not as bright as its surroundings make its mean."""
-    once = ndimage.uniform_filter(picture, SMOOTH)
+    once = ndimage.uniform_filter(image, SMOOTH)
     return 2 * once - ndimage.uniform_filter(once, SMOOTH)
 
 
 def _ending(pair: Sequence[tuple[np.ndarray, np.ndarray]], top: float, step: float) -> tuple[float, ...] | None:
-    """(b, its standard error, K) of a pair of (picture, level); None where it tells nothing."""
+    """(b, its standard error, K) of a pair of (image, level); None where it tells nothing."""
     (first, s1), (second, s2) = pair
     with np.errstate(divide="ignore", invalid="ignore"):
         square = ndimage.convolve(first / s1 - second / s2, LAPLACIAN) ** 2

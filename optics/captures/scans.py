@@ -1,4 +1,4 @@
-"""Scan folders of a bench that lights one LED per picture: plates of balls pressed into the gel, and the flat field.
+"""Scan folders of a bench that lights one LED per image: plates of balls pressed into the gel, and the flat field.
 
     import_scans("scans", "captures/bench", bin=8)
 
@@ -19,7 +19,7 @@ Derived, not measured, and said so:
     noise      variance against signal of half the squared differences of neighbours in image over flat field, where no
                ball is near
     lights     the direction of the least-squares fit I/F = l.n + c on the balls, both less the pedestal, at DISTANCE
-    pedestal   what the camera reads without light, by the noise of its pictures (`photon_noise`), unless it is given
+    pedestal   what the camera reads without light, by the noise of its images (`photon_noise`), unless it is given
     black      values that are cut off below (`corrections.black_levels`): masked, of blocks the whole block
     stretch    how far each press spreads the skin (optics.captures.skin_motion): `gel.stretch` and its slopes, of no
                effect until `stretched coating` is asked for
@@ -66,7 +66,7 @@ SMALLEST, ACROSS = 5.0, 200  # px of a ball's radius at least, and how many of t
 DISTANCE = 30.0  # mm from the middle of the face to a light, where no better is known
 # Standard deviations of priors, by judgement. Circles are annotated to a pixel, and together they fix where a plate is,
 # but for a shift of camera or lens; a holder centres the lights on the camera's axis within a few mm.
-ANNOTATED = 1.5  # px of the whole picture
+ANNOTATED = 1.5  # px of the whole image
 CENTRED = 3.0  # mm
 CAMERA = 200.0  # mm: nearly telecentric, as lenses for inspection are
 CONTACT = 0.85  # of the ball's radius: touched, where nothing tells

@@ -58,7 +58,9 @@ def import_(
             help="For a folder: a table with the columns file, center_x_px, center_y_px, contact_radius_px.",
         ),
     ] = None,
-    ball_radius: Annotated[float | None, typer.Option("--ball-radius", help="mm")] = None,
+    ball_radius: Annotated[
+        float | None, typer.Option("--ball-radius", help="Radius of the ball, mm [2 for a Taxim pack].")
+    ] = None,
     mm_per_pixel: Annotated[
         float | None, typer.Option("--mm-per-pixel", help="Scale of the images before --bin.")
     ] = None,

@@ -204,7 +204,7 @@ def force_test(
 ) -> None:
     """Test a learnt map on presses of known forces.
 
-    Prints aRMSE (13), d_loc (16), RMSE_mc (17), and its time."""
+    Prints aRMSE, d_loc and RMSE_mc, which are (13), (16) and (17) of Sensors 19, 928 (2019), and its time."""
     from optics.readers.force_learning import FeatureSet, ForceModel
 
     _told(ForceModel.read(model), {str(file): FeatureSet.read(file) for file in features}, as_json)

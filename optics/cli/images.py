@@ -257,7 +257,7 @@ def export(
     ] = "camera",
     array: Annotated[
         list[str] | None,
-        typer.Option("--array", metavar="NAME", help="Take this array. Repeatable.", show_default="all"),
+        typer.Option("--array", metavar="NAME", help="Export only this array. Repeatable.", show_default="all"),
     ] = None,
     per_file: Annotated[int, typer.Option("--per-file", metavar="N", help="Samples per file.")] = 1000,
     licence: Annotated[str, typer.Option("--licence", help="Licence of the data, for the data card.")] = "",

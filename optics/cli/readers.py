@@ -52,7 +52,11 @@ def read(
     ] = None,
     threshold: Annotated[
         float | None,
-        typer.Option("--threshold", help="proximity: sd of a pixel's noise by which the object differs.", min=0.0),
+        typer.Option(
+            "--threshold",
+            help="proximity: detect the object where a pixel differs by so many sd of its noise.",
+            min=0.0,
+        ),
     ] = None,
     curve: Annotated[
         Path | None,

@@ -188,6 +188,7 @@ def _span(bounds: Sequence[float]) -> str:
 
 def _new_effect(name: str | None, plugins: Sequence[Path] | None, **given: Any) -> None:
     """Write a plugin file, print its path, and note what comes next."""
+    from optics.files.output import shipped
     from optics.scene.declare import STAGES
     from optics.study import draft
 
@@ -201,6 +202,11 @@ def _new_effect(name: str | None, plugins: Sequence[Path] | None, **given: Any) 
         stage = draft.stage_of(given["part"], given["stage"])
         draft.check_name(name, STAGES[stage], registry)
         text, folder = draft.new_effect(name, stage), plugins[0] if plugins else Path("plugins")
+        if not given["o"] and folder.resolve() == shipped("plugins").resolve():
+            raise ValueError(
+                f"optics effects new: {folder} is the folder of the plugins that ship; name one of your own, such as "
+                "-o my_plugins"
+            )
     else:
         if given["stage"] or given["part"]:
             raise ValueError(

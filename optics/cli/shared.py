@@ -223,7 +223,10 @@ FrameName = Annotated[
         show_default="the values that all frames share",
     ),
 ]
-Variant = Annotated[str | None, typer.Option("--variant", help="Mitsuba variant.", show_default=False)]
+Variant = Annotated[
+    str | None,
+    typer.Option("--variant", help="Mitsuba variant, such as cuda_ad_spectral_polarized.", show_default=False),
+]
 Force = Annotated[bool, typer.Option("--force", help="Replace existing files.")]
 At = Annotated[
     str | None,

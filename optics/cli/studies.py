@@ -53,7 +53,8 @@ def locate(
         typer.Option(
             "--free",
             metavar="PATTERN",
-            help="Parameters to solve for with the positions. Repeatable. Without it: the powers of the lights.",
+            help="Parameters to solve for, such as 'led_*.x'. Repeatable. Without it: what the parts declare as free "
+            "(an LED's position, axis, lobe and power, a source's power, a membrane's reflectance and roughness, ...).",
         ),
     ] = None,
     define: Defines = None,
@@ -97,8 +98,9 @@ def calibrate(
         typer.Option(
             "--free",
             metavar="PATTERN",
-            help="Parameters to solve for, such as 'led_*.x'. Repeatable. Without it: every "
-            "LED's position, axis, lobe and power, every membrane's reflectance and roughness.",
+            help="Parameters to solve for, such as 'led_*.x'. Repeatable. Without it: what the "
+            "parts declare as free (an LED's position, axis, lobe and power, a source's power, reflectance and roughness "
+            "of a membrane, ...).",
         ),
     ] = None,
     per_group: Annotated[
@@ -434,7 +436,7 @@ def imitate(
     plugins: Plugins = None,
     captures: CapturesNow = None,
 ) -> None:
-    """Write captures as the study's model would take them.
+    """Simulate captures with the study's model.
 
     With --set camera.vignetting=0.3, for example, they show what this effect would look like."""
     from optics.facade import Study

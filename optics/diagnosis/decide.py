@@ -31,6 +31,7 @@ from optics.words import p_text, percent
 MANY = 3  # effects of one explanation
 DIALS = "dials known"  # of an effect with a strength per frame
 LIGHT = "light"
+HOMOGENEITY = "homogeneity"
 RIVALS = "rivals calibrated"  # of pairs of effects of images, which are dear
 LAW = "no other law"  # of an effect that the model has already
 CLUTTER = "beyond clutter"  # of the strength, which parts of the data tell
@@ -180,7 +181,7 @@ def decide(f: Findings) -> tuple[str, list[Condition]]:
                 1.0,
                 LEVEL,
                 False,
-                "no effect is told apart from none when everything is calibrated again",
+                "after everything is calibrated again, no effect explains more than chance does",
             )
         )
         if not f.structured and not f.weighed:
@@ -233,7 +234,7 @@ def _word_of_winner(f: Findings, failed: set[str]) -> str:
     if failed & {"lead", LAW, "robust", DIALS, RIVALS, NO_DETAIL} and alone and f.some_even and rivals:
         return "AMBIGUOUS"
     some = failed - {"spread", NO_DETAIL}
-    return "PARTIAL" if some and some <= {"share", "even"} else ""
+    return "PARTIAL" if some and some <= {"share", HOMOGENEITY} else ""
 
 
 def _is_anything_there(f: Findings, significant: bool) -> list[Condition]:
@@ -313,17 +314,17 @@ def _against_causes_outside(f: Findings) -> list[Condition]:
             f.ratio,
             limit,
             not f.rival,
-            f"the best curve ({f.coordinate or 'none'}) explains {f.ratio:.2f} of it, "
-            + (f"{limit:g} allowed" if f.rival or f.ratio < limit else "but not when its bins are counted"),
+            f"the best curve ({f.coordinate or 'none'}) explains {f.ratio:.2f} times as much as the best explanation, "
+            + (f"{limit:g} allowed" if f.rival or f.ratio < limit else "but not after the cost of its bins"),
         ),
         Condition(
             LAW,
             f.law_lead,
             SURE,
             f.law_lead > SURE,
-            f"{f.law_lead:.3g} ahead of another law of {f.law}, {SURE:.3g} needed"
+            f"{f.law_lead:.3g} ahead of a freer law of {f.law}, {SURE:.3g} needed"
             if f.law
-            else "no effect that the model has explains it by another law",
+            else "no freer law of an added effect explains it",
         ),
         _unless(
             f.unset,
@@ -334,8 +335,8 @@ def _against_causes_outside(f: Findings) -> list[Condition]:
         _unless(
             f.run_away,
             LIGHT,
-            f"{f.run_away}: the model calls that light dark in every frame, and what leads there may lead nowhere "
-            "else. Say about how strong it is by a prior on its power (--prior)",
+            f"{f.run_away}: the model lets almost none of that light through, so an effect may lead only because of "
+            "this power. Give the power a prior (--prior)",
             "no power stands apart from the others",
         ),
         Condition(
@@ -390,16 +391,16 @@ def _of_the_strength(f: Findings) -> list[Condition]:
             f.chance,
             LEVEL,
             not f.chance >= LEVEL,
-            "not asked of readings, and too few parts of images to tell"
+            "not applied: readings, or images with too few parts"
             if math.isnan(f.chance)
             else f"p {p_text(f.chance)} by the scatter between parts of the data, against {LEVEL:g}",
         ),
         Condition(
-            "even",
+            HOMOGENEITY,
             f.uneven,
             f.uneven_limit,
             f.even,
-            "not asked: it explains too little, or the data have no parts to compare"
+            "not applied: it explains too little, or the data have no parts to compare"
             if math.isnan(f.uneven)
             else f"splitting its strength{f.uneven_by} gains {f.uneven:.2f} of the fall, {f.uneven_limit:.2g} allowed",
         ),
@@ -408,7 +409,11 @@ def _of_the_strength(f: Findings) -> list[Condition]:
             f.held_out,
             0.0,
             f.held_out > 0 or (math.isnan(f.held_out) and f.ahead > 0),
-            ("no frames were held out" if math.isnan(f.ahead) else "no frames were held out, but blocks of readings")
+            (
+                "no frames were held out"
+                if math.isnan(f.ahead)
+                else "no frames were held out; blocks of readings were left out instead"
+            )
             if math.isnan(f.held_out)
             else f"chi2 of held-out frames falls by {f.held_out:.3g}"
             if f.held_out > 0 or f.refuted

@@ -10,7 +10,7 @@ import numpy as np
 
 from optics.captures import noise as camera_noise
 from optics.diagnosis import statistics as st
-from optics.diagnosis.decide import CURVE, Findings
+from optics.diagnosis.decide import CURVE, HOMOGENEITY, Findings
 from optics.diagnosis.evidence import Candidate, Evidence, at_bound, measure, priors
 from optics.diagnosis.explanations import Outcome, Trial, wander_of
 from optics.diagnosis.refit import Case
@@ -131,11 +131,11 @@ def write_verdicts(
     for c in table.order:
         mine = [s for s in splits if s.effect == c.effect.name]
         if mine and not all(s.holds for s in mine):
-            c.row.flags.append("uneven")
+            c.row.flags.append("inhomogeneous")
         if c.row.refit is None and c.row.net <= 0 or c.row.p_family >= LEVEL:
             c.row.verdict = "nothing visible" if "nothing visible" in c.row.flags else "no evidence"
         elif word == "CLAIM" and c is winner:
-            c.row.verdict = "MISSING"
+            c.row.verdict = "claimed"
         elif word == "AMBIGUOUS" and c in members:
             c.row.verdict = "possible"
         elif word == "PARTIAL" and c is winner:
@@ -170,7 +170,8 @@ def warnings_of(
     noisy = [c.effect.name for c in table.order if c.row.kappa > KAPPA]
     if noisy:
         texts.append(
-            f"derivative images are noisy (kappa above {KAPPA:g}): {', '.join(noisy)}; render with more samples"
+            f"the noise of derivative images exceeds {KAPPA:.0%} of their signal: {', '.join(noisy)}; render with more "
+            "samples"
         )
     if basis.high_frequency < SMOOTH:
         texts.append(
@@ -283,7 +284,7 @@ def hints_of(
         hints.append(
             "hold out other frames (other presses or positions), or find why the held-out frames do not improve"
         )
-    if "even" in failed:
+    if HOMOGENEITY in failed:
         hints.append(
             "look at the parts of the data between which its strength differs most (optics view shows what is left of "
             "every frame): what sets them apart is not in the model, or was noted wrongly"
@@ -295,7 +296,12 @@ def hints_of(
             "check [noise]: repeats of one frame determine system_gain and dark_noise, a flat_field removes the "
             "sensor's own pattern"
         )
-    if word == "UNKNOWN":
+    if word == "UNKNOWN" and findings.another_law:
+        hints.append(
+            f"write an effect with the law that this sensor follows ({findings.law}), or state the errors of settings "
+            "under [uncertainty]"
+        )
+    elif word == "UNKNOWN":
         hints.append(
             "draft an effect from the curve (optics effects new NAME --from STUDY), add it, and diagnose again"
         )

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from optics.diagnosis.decide import CURVE, Findings, wander_text
+from optics.diagnosis.decide import CURVE, HOMOGENEITY, Findings, wander_text
 from optics.diagnosis.result import (
     NAMED,
     PLANS,
@@ -162,9 +162,9 @@ def sentence(
         return _ambiguous(f, explanations)
     if word == "UNKNOWN" and f.another_law:
         return (
-            f"structure is left that another law of {f.law} explains. With a strength that changes along it, this law "
-            f"is {-f.law_lead:.3g} ahead of every effect of the library. The effect is in the model, but this sensor "
-            "follows another law."
+            f"structure is left that a freer law explains: {f.law}, with a strength that changes along it. Its score "
+            f"is {-f.law_lead:.3g} above that of the best effect. The effect is in the model, but this sensor follows "
+            "another law."
         )
     if word == "UNKNOWN":
         return _unknown(f, next(c for c in fingerprints if c.coordinate == f.coordinate), basis)
@@ -234,7 +234,7 @@ def _claim(
     else:
         lowered = f"held-out misfit from {percent(levels[0].held_out)} to {percent(levels[-1].held_out)}"
     text += (
-        f" Adding {'it' if len(best.effects) == 1 else 'all of the first'} lowers {lowered} "
+        f" Adding {'it' if len(best.effects) == 1 else best.name} lowers {lowered} "
         f"(noise: {percent(basis.noise)}). Its strength is the same in every part of the data."
     )
     others = [] if leaves_misfit(best.excess_sd, basis) else [r for r in rows if r is not row and limits(r)]
@@ -251,8 +251,8 @@ def _claim(
         else f" With {best.name} {_left(best)} is left: add it, calibrate and diagnose again."
     )
     return text + (
-        " A lower held-out error verifies the prediction, not the cause. The cause rests on the lead "
-        f"({f.lead:.3g} in chi2, over {f.against or 'no effect'}), the homogeneity and the absence of a better curve."
+        " A lower held-out error verifies the prediction, not the cause. The evidence for the cause is the lead in "
+        f"score ({f.lead:.3g}, over {f.against or 'no effect'}), the homogeneity, and that no curve does better."
     )
 
 
@@ -302,11 +302,11 @@ def _ambiguous(f: Findings, explanations: Sequence[Explanation]) -> str:
     if f.unset:
         return (
             f"the captures state no error of {f.unset}. Such errors act on each frame, as one strength per frame "
-            f"does, and the data do not decide between them and: {names}.{other}"
+            f"does. The data do not decide between these errors and: {names}.{other}"
         )
     if f.law_lead <= SURE:
         return (
-            f"the data do not decide between another law of {f.law}, which is in the model, and "
+            f"the data do not decide between a freer law of {f.law}, which is in the model, and "
             f"{'this explanation' if count == 1 else f'{count} explanations'} (fall of chi2): {names}.{other}"
         )
     if count > 1:
@@ -330,7 +330,7 @@ def _kind(kind: Sequence[Explanation]) -> str:
 
 
 def _partial(f: Findings, winner: Row, failing: Sequence[Condition]) -> str:
-    uneven = next((c for c in failing if c.name == "even"), None)
+    uneven = next((c for c in failing if c.name == HOMOGENEITY), None)
     if uneven is None:
         rest = share_text(1 - f.share)
         return f"{winner.name} explains {share_text(f.share)} of the excess misfit, {rest} has another cause."
@@ -344,7 +344,7 @@ def _partial(f: Findings, winner: Row, failing: Sequence[Condition]) -> str:
 def _unknown(f: Findings, curve: Fingerprint, basis: Basis) -> str:
     best = f"{f.ratio:.3g} times as much as the best effect" if f.winner else "what no effect does"
     if f.winner and f.beside:
-        best += ", of what noise that neighbours share leaves to explain"
+        best += ", both counted beside noise that neighbours share"
     i = int(np.argmax(np.abs(curve.curve)))
     size = percent(curve.curve[i]) if curve.kind == "gain" else f"{curve.curve[i]:.2g} DN"
     where = curve.labels[i] if curve.labels else f"{curve.coordinate} {curve.centres[i]:.3g}{spaced(curve.unit)}"
@@ -436,8 +436,8 @@ def _cells(r: Row, d: Diagnosis) -> tuple[str, ...]:
     reaches = [r.reach(i) for i in range(len(now))]
     known = any(reach.holds(v, s) for reach, v, s in zip(reaches, now, sd))  # else its size says nothing either
     note = ", ".join([x for x in (r.verdict, *r.flags) if x])
-    if r.verdict == "MISSING":
-        note += f" (even: yes, held out: {'yes' if d.levels[-1].fall > 0 else 'no'})"
+    if r.verdict == "claimed":
+        note += f" (homogeneous: yes, held out: {'yes' if d.levels[-1].fall > 0 else 'no'})"
     return (
         r.name,
         f"{r.fall:.4g}",
@@ -482,14 +482,14 @@ def _split_lines(d: Diagnosis) -> list[str]:
         return []
     lines = [
         "",
-        "homogeneity (strength relative to the whole; h = gain by splitting over the fall; p by noise / by the scatter "
-        "between parts)",
+        "homogeneity (strength relative to the whole; h = (fall gained by splitting) / (fall); p by noise / by the "
+        "scatter between parts)",
     ]
     for s in d.splits:
         parts = ", ".join(f"{label} {with_sd(x, sd)}" for label, x, sd in zip(s.labels[:8], s.strength, s.sd))
         lines.append(
             f"  {s.effect} by {s.by}: h {s.h:.3f}, p {p_text(s.p)} / {p_text(s.chance)}"
-            f"{'' if s.holds else '  UNEVEN'}: {parts}"
+            f"{'' if s.holds else '  INHOMOGENEOUS'}: {parts}"
         )
     return lines
 

@@ -1,7 +1,7 @@
 """Branches: other minima of what single frames have for themselves.
 
 Between crossed films a photograph is as bright on either side of the extinction, I = P sin^2(d) with d the sum of what
-two dials are off. On which side it is, only a detail of the picture tells (how the extinction runs across the field),
+two dials are off. On which side it is, only a detail of the image tells (how the extinction runs across the field),
 and a descent stays on the side that it began on. What a frame has for itself is walked along the direction in which
 its image tells most of it, in all frames at once, as they do not depend on each other; where another minimum is lower,
 everything is calibrated again from there. If no bright frame tells the light, P may be wrong together with the sides of

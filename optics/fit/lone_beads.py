@@ -1,4 +1,4 @@
-"""How bright a ball is that nothing shades: the renderer's own pictures of a few balls at a time."""
+"""How bright a ball is that nothing shades: the renderer's own images of a few balls at a time."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from optics.fit.scene_model import SceneModel
 from optics.scene.parameter import Values
 
 APART = 6.5  # diameters between balls, so that few stand in the light of another
-DRAWS = 12  # pictures
+DRAWS = 12  # images
 INNER = 0.97  # of a radius, within which the samples of a pixel must lie
 
 
@@ -78,4 +78,4 @@ def glow(
         lights.append(image.reshape(-1, image.shape[2])[pixels[ball, box]])
         images.append(image)
     found = Glow.fitted(*(np.concatenate(a) for a in (places, normals, lights)))
-    return found, np.median(images, 0)  # each pixel shows the ground in most of the pictures
+    return found, np.median(images, 0)  # each pixel shows the ground in most of the images

@@ -1,14 +1,14 @@
-"""Balls painted by numpy: a quick picture of a crowd, and how it changes where one ball moves.
+"""Balls painted by numpy: a quick image of a crowd, and how it changes where one ball moves.
 
-A renderer needs a second for a picture of beads that shade each other. Where thousands of places are tried, a plainer
-picture does:
+A renderer needs a second for an image of beads that shade each other. Where thousands of places are tried, a plainer
+model does:
 
     light of a place s of a ball with the normal n = share (polynomial of s, 2nd degree) x (1, n, n n)       `Glow`
     share: of its lights' irradiance, those that no other ball stands in the way of                          `shaded`
     a sample of a pixel shows the nearest ball that its ray meets, or the background                         `layers`
 
 `Glow` is fitted to what the renderer itself says of balls that stand alone (`optics.fit.lone_beads`). As each sample
-knows the nearest ball and the one behind it, the change of the picture by a move of one ball is found for all balls at
+knows the nearest ball and the one behind it, the change of the image by a move of one ball is found for all balls at
 once."""
 
 from __future__ import annotations

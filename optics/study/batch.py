@@ -11,6 +11,12 @@
     labels  = ["force", "pressure"]            # for learners (optics.light.labels); none without it
     [defines]                                  # of the XML's <default>s
     width = 320
+    [noise]                                    # of the output "dn"; see captures
+    system_gain = 0.2                          # DN per electron
+    dark_noise  = 2.0                          # DN
+    black_level = 64.0
+    saturation  = 1023.0
+    prnu        = 0.0
     [parameters]                               # the same in every image
     "gel.indenter_size" = 2.0
     [sample]

@@ -71,14 +71,14 @@ def after_calibration(model: SceneModel, found: Fit, level: Row | None) -> list[
     if (misfit := weight_of(found.variables)) > 1:
         texts.append(
             "the model misses the images by more than their noise. Errors include this misfit: they are "
-            f"{misfit**0.5:.3g} times those of noise alone. The priors weigh as much more, so that parameters stay "
-            "near them until the missing effect is found"
+            f"{misfit**0.5:.3g} times those of noise alone. Priors count {misfit:.3g} times as much relative to the "
+            "images, so that parameters stay near them until the missing effect is found"
         )
     texts += _far_lights(model, found)
     if apart := powers_apart(model, found):
         texts.append(
-            f"{apart}: the model calls that light dark in every frame, so that its power explains what is missing. "
-            "Where lamps are known to be more alike, say so by a prior on the power (--prior)"
+            f"{apart}: the model lets almost none of that light through, and its power explains what is missing. If "
+            "the lamps are known to be more alike, give this power a prior (--prior)"
         )
     known = [(v, value_of(model, found.values, v), v.prior) for v in found.variables if v.prior is not None]
     moved = [(v, value, prior) for v, value, prior in known if abs(value - prior[0]) > SURPRISING * prior[1]]
@@ -111,8 +111,8 @@ def _far_lights(model: SceneModel, found: Fit) -> list[str]:
         if astray and after > max(2 * before, COLLIMATED * max(across)):
             name = led if board is None else board.name
             texts[name] = (
-                f"{name} ran to {after:.3g} mm from {before:.3g} mm: over the {max(across):.3g} mm of the face it acts "
-                "like collimated light. A model does that if light that fills shadows and slopes is missing: test "
+                f"{name} moved from {before:.3g} mm to {after:.3g} mm, where its light is practically collimated over "
+                f"the {max(across):.3g} mm of the face. This happens if light that fills shadows is missing: test "
                 "'light returned by the window', 'ambient light' and 'interreflection'"
             )
     return list(texts.values())
@@ -171,9 +171,10 @@ def repeated_images(model: SceneModel) -> list[str]:
             pairs.append((twin, f.name))
     if not pairs:
         return []
+    twin, own = pairs[0]
     return [
-        f"{len(pairs)} of {len(model.frames)} images have the pixels of another one, such as '{pairs[0][1]}' those of "
-        f"'{pairs[0][0]}': one reading counts as two. Look at the files, and leave copies out"
+        f"{len(pairs)} of {len(model.frames)} images are identical to another one ('{own}' to '{twin}'), "
+        "so that one measurement counts twice. Check the files and remove copies"
     ]
 
 

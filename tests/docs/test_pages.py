@@ -49,6 +49,19 @@ def test_the_example_of_captures_toml_is_read(tmp_path):
     assert found.scene == "gelsight" and found.frames[0].parameters["gel.press_depth"] == 0.5
 
 
+def test_the_example_of_a_job_is_read(mitsuba, tmp_path):
+    """It names all that its outputs need, and draws from all that the scene has."""
+    from optics.study import batch
+
+    file = tmp_path / "job.toml"
+    file.write_text(
+        re.search(r"```toml\n(scene   = \"gelsight\".*?)```", page("batches"), re.DOTALL)[1], encoding="utf-8"
+    )
+    job = batch.read(file)
+    maker = batch.Maker(job, file, None)
+    assert job.count == 1000 and maker.noise is not None
+
+
 def test_the_examples_of_tables_are_read(tmp_path):
     """Volts with semicolons and decimal commas, whole lux with a column of uncertainties; what is known besides."""
     from optics.captures import capture_set as captures

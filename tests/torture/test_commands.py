@@ -245,7 +245,7 @@ def test_copies_of_an_image_are_named(place, capsys, monkeypatch):
     file = place / "images" / "captures.toml"
     file.write_text(file.read_text().replace('repeats = ["c.png"]\n', ""))
     assert main(["compare", "images"]) == 0
-    assert "1 of 2 images have the pixels of another one, such as 'b' those of 'a'" in capsys.readouterr().err
+    assert "1 of 2 images are identical to another one ('b' to 'a')" in capsys.readouterr().err
 
 
 def test_tables_of_circles_name_images_of_their_folder(place, met, monkeypatch):

@@ -241,8 +241,8 @@ def test_what_leaves_an_unnoticed_lamp_is_a_rival_of_gains_of_each_frame(monkeyp
 
 @pytest.mark.parametrize("brings, instead", [(2.0, True), (400.0, False)])
 def test_gains_of_each_frame_lead_in_place_of_what_explains_nothing_beside_a_lamp(monkeypatch, brings, instead):
-    """Where a lamp that wanders explains all, what leads beside it is the cheapest effect, a tone curve that brings 2 of
-    chi2: the gains, which cost more than that lamp, are the same and lead in its place. A tone curve that is there
+    """Where a lamp that wanders explains all, what leads beside it is the cheapest effect, a tone curve that brings 2
+    of chi2: the gains, which cost more than that lamp, are the same and lead in its place. A tone curve that is there
     leads as it did."""
 
     def trial(name, deviance, gain, by_frame):

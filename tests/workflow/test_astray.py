@@ -46,7 +46,7 @@ def test_shapes_do_not_make_up_for_light(captures, tmp_path, monkeypatch):
     assert off(held.fit) < 1 and held.fit.tempering > 1e3
     # one standard deviation of noise is a hundredth of a micrometre: errors count the misfit
     assert held.fit.error[2] > 0.5 * KNOWN["gel.smoothing"][1] > 100 * held.fit.sd[2]
-    assert any("priors weigh as much more" in warning for warning in held.fit.warnings)
+    assert any("Priors count" in warning for warning in held.fit.warnings)
 
     held.add("ambient light")
     assert held.fit.values.common["membrane.ambient"] == pytest.approx(AMBIENT, rel=0.01)

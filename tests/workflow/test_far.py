@@ -82,7 +82,9 @@ def test_a_light_that_ran_away_is_named_for_what_it_is():
         return checks._far_lights(model, fit)
 
     (text,) = told(-45.0, (-12.0, 2.0))
-    assert text.startswith("led ran to 45 mm from 12 mm: over the 10 mm of the face it acts like collimated light")
+    assert text.startswith(
+        "led moved from 12 mm to 45 mm, where its light is practically collimated over the 10 mm of the face"
+    )
     assert told(-20.0, (-12.0, 2.0)) == told(-45.0, None) == told(-45.0, (-12.0, 20.0)) == []
 
 

@@ -264,7 +264,7 @@ def demo_diagnosis(rows, found, index, names) -> dict:
                 "confused_with": "LED lobe" if k == 0 else "",
                 "cos": 0.79,
                 "flags": [],
-                "verdict": "MISSING" if k == 0 and claim else "",
+                "verdict": "claimed" if k == 0 and claim else "",
                 "refit": {"fall": fall, "strength": [strength], "sd": [sd]} if claim else None,
             }
         )
