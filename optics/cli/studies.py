@@ -53,8 +53,7 @@ def locate(
         typer.Option(
             "--free",
             metavar="PATTERN",
-            help="Parameters to solve for, such as 'led_*.x'. Repeatable. Without it: what the parts declare as free "
-            "(an LED's position, axis, lobe and power, a source's power, a membrane's reflectance and roughness, ...).",
+            help="Parameters to solve for with the positions. Repeatable. Without it: the powers of the lights.",
         ),
     ] = None,
     define: Defines = None,
@@ -99,8 +98,8 @@ def calibrate(
             "--free",
             metavar="PATTERN",
             help="Parameters to solve for, such as 'led_*.x'. Repeatable. Without it: what the "
-            "parts declare as free (an LED's position, axis, lobe and power, a source's power, reflectance and roughness "
-            "of a membrane, ...).",
+            "parts declare as free (an LED's position, axis, lobe and power, a source's power, a membrane's "
+            "reflectance and roughness, ...).",
         ),
     ] = None,
     per_group: Annotated[
