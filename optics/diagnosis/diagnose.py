@@ -16,7 +16,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -31,8 +32,20 @@ from optics.diagnosis.explanations import Outcome
 from optics.diagnosis.findings import basis_of, findings_of, followed, subject_of
 from optics.diagnosis.laws import other_laws
 from optics.diagnosis.refit import COARSE, Case, Cooled, Expected, after_at, refit_each
-from optics.diagnosis.result import NAMED, Basis, Diagnosis, Family, Fingerprint, Level, Row, Split, kinds_of
-from optics.diagnosis.score import score
+from optics.diagnosis.result import (
+    NAMED,
+    Basis,
+    Diagnosis,
+    Family,
+    Fingerprint,
+    Law,
+    Level,
+    Row,
+    Shift,
+    Split,
+    kinds_of,
+)
+from optics.diagnosis.score import Scored, score
 from optics.diagnosis.text import leaves_misfit, sentence
 from optics.diagnosis.thresholds import CLEAR, EXCESS, LEVEL, MARGIN, MAX_SPLIT, SHARE, close
 from optics.errors import Underdetermined
@@ -54,35 +67,15 @@ SURFACE_HINT = (
 FIXED_HINT = "divide the pattern out with a flat_field, mask what is dirt, or note the sensor's own as [noise] prnu"
 
 
-def diagnose(
-    model: Model,
-    fit: Fit,
-    effects: Sequence[Effect],
-    variables_of: Callable[[Effect], Sequence[Variable]],
-    held_out: Sequence[int] = (),
-    *,
-    fitted: Sequence[int],
-    refit: Callable[..., Fit] | None = None,
-    foresee: Callable[[Sequence[Sequence[Variable]], Progress], None] | None = None,
-    cooler: Callable[[Sequence[Fit]], Cooled | None] | None = None,
-    negligible: float = COARSE,
-    rows_max: int = 400_000,
-    seed: int = 0,
-    top: int = 5,
-    progress: Progress | None = None,
-    ranked: Callable[[list[Row]], None] | None = None,
-    excluded: Mapping[str, str] | None = None,
-    added: Sequence[Effect] = (),
-    asked: Collection[str] = (),
-    expected: Sequence[Expected] = (),
-) -> Diagnosis:
-    """Score, refit and judge: which effect a calibrated model lacks.
+@dataclass(frozen=True)
+class Request:
+    """What is diagnosed, and how.
 
     fit           of the base on the frames `fitted`, converged
     effects       candidates; those that are in the base already are passed over
     variables_of  the variables that an effect frees; one per frame for the scope 'frame'
     held_out      frames that were not fitted; only what each frame has for itself is fitted there
-    refit         `optics.fit.calibrate.fit` unless given; called as refit(model, variables, start, frames=[...])
+    refit         called as refit(model, variables, start, frames=[...])
     foresee       called before the refits, with the variables of each effect that is refitted
     cooler        called with the refits, the best first. Where that one asks that priors count less than in the
                   base, and that may change the verdict, it returns what the diagnosis begins again from; else None
@@ -92,99 +85,174 @@ def diagnose(
     top           how many of the best effects are refitted, besides those that cannot be told from the best
     ranked        called with the ranking by score, before anything is refitted: refits of images take minutes
     excluded      effect -> why it is not among `effects`, for the record
-
     added         effects that the model has already, whose laws may differ from the library's (optics.diagnosis.laws)
     asked         names of effects that are refitted, whatever their score
     expected      what an earlier diagnosis of the study found beside effects that were added since
 
+    Raises ValueError when frames are fitted and held out at once.
+    """
+
+    model: Model
+    fit: Fit
+    effects: Sequence[Effect]
+    variables_of: Callable[[Effect], Sequence[Variable]]
+    held_out: Sequence[int] = ()
+    fitted: Sequence[int] = ()
+    refit: Callable[..., Fit] = calibrate.fit
+    foresee: Callable[[Sequence[Sequence[Variable]], Progress], None] | None = None
+    cooler: Callable[[Sequence[Fit]], Cooled | None] | None = None
+    negligible: float = COARSE
+    rows_max: int = 400_000
+    seed: int = 0
+    top: int = 5
+    progress: Progress | None = None
+    ranked: Callable[[list[Row]], None] | None = None
+    excluded: Mapping[str, str] = field(default_factory=dict)
+    added: Sequence[Effect] = ()
+    asked: Collection[str] = ()
+    expected: Sequence[Expected] = ()
+
+    def __post_init__(self) -> None:
+        both = sorted(set(self.fitted) & set(self.held_out))
+        if both:
+            raise ValueError(f"diagnose: frames {both} are fitted and held out at once; a frame is one or the other")
+
+
+def diagnose(
+    model: Model,
+    fit: Fit,
+    effects: Sequence[Effect],
+    variables_of: Callable[[Effect], Sequence[Variable]],
+    held_out: Sequence[int] = (),
+    *,
+    fitted: Sequence[int],
+    **options: Any,
+) -> Diagnosis:
+    """Score, refit and judge: which effect a calibrated model lacks. All arguments are fields of `Request`.
+
     Raises Underdetermined when the base is not calibrated to convergence, or black level or saturation are unknown;
     ValueError when frames are fitted and held out at once, or none is fitted.
     """
-    say = progress or silent
     fitted, held_out = [int(i) for i in fitted], [int(i) for i in held_out]
-    both = sorted(set(fitted) & set(held_out))
-    if both:
-        raise ValueError(f"diagnose: frames {both} are fitted and held out at once; a frame is one or the other")
-    scored = score(model, fit, effects, variables_of, fitted, rows_max=rows_max, seed=seed, progress=progress)
-    evidence, table = scored.evidence, scored.table
-    if ranked:
-        ranked([c.row for c in table.order])
-    case = Case(
-        model,
-        fit,
-        evidence,
-        table,
-        refit or calibrate.fit,
-        fitted,
-        held_out,
-        variables_of,
-        rows_max,
-        seed,
-        say,
-        foresee=foresee,
-        negligible=negligible,
+    return _diagnosed(Request(model, fit, effects, variables_of, held_out, fitted, **options))
+
+
+def _diagnosed(request: Request) -> Diagnosis:
+    """The steps of the module, one after the other."""
+    scored = score(
+        request.model,
+        request.fit,
+        request.effects,
+        request.variables_of,
+        request.fitted,
+        rows_max=request.rows_max,
+        seed=request.seed,
+        progress=request.progress,
     )
-    known = {c.effect.name for c in table.order}
-    near = [e for e in expected if e.names <= known]
-    case.expected = [e for e in near if after_at(case, e.values) < case.before - CLEAR]
-    if isinstance(evidence.spectrum, st.Sweeps) and evidence.thinning == 1:
-        evidence.spectrum.apart = case.session.apart
-    basis = basis_of(model, evidence, evidence.structure(evidence.whitened, evidence.base))
-    case.places = places = prints.places(model, fit.values, evidence)
-    chosen = _choose(case, top, asked)
+    if request.ranked:
+        request.ranked([c.row for c in scored.table.order])
+    case = _case_of(request, scored)
+    chosen = _choose(case, request.top, request.asked)
     due = {name for e in case.expected if len(e.names) == 1 for name in e.names} - {c.effect.name for c in chosen}
-    chosen += [c for c in table.order if c.effect.name in due]
+    chosen += [c for c in case.table.order if c.effect.name in due]
     fits = refit_each(case, chosen)
-    if cooler is not None and (cooled := cooler(_best_first(case, fits))):
+    if request.cooler is not None and (cooled := request.cooler(_best_first(case, fits))):
+        cooler = replace(request, fit=cooled.base, refit=cooled.refit, foresee=cooled.foresee, cooler=None, asked=fits)
         try:
-            again = diagnose(
-                model,
-                cooled.base,
-                effects,
-                variables_of,
-                held_out,
-                fitted=fitted,
-                refit=cooled.refit,
-                foresee=cooled.foresee,
-                negligible=negligible,
-                rows_max=rows_max,
-                seed=seed,
-                top=top,
-                progress=progress,
-                ranked=ranked,
-                excluded=excluded,
-                added=added,
-                asked=fits,
-                expected=expected,
-            )
+            again = _diagnosed(cooler)
         except Underdetermined:  # with priors that count less the base has no end
             pass
         else:
             again.warnings.append(cooled.remark)
             return again
+    judged = _judge(request, case, chosen, fits)
+    return _written(request, scored, case, chosen, fits, judged)
+
+
+def _case_of(request: Request, scored: Scored) -> Case:
+    """What refits and the competition work on."""
+    evidence, table = scored.evidence, scored.table
+    case = Case(
+        request.model,
+        request.fit,
+        evidence,
+        table,
+        request.refit,
+        list(request.fitted),
+        list(request.held_out),
+        request.variables_of,
+        request.rows_max,
+        request.seed,
+        request.progress or silent,
+        foresee=request.foresee,
+        negligible=request.negligible,
+    )
+    known = {c.effect.name for c in table.order}
+    near = [e for e in request.expected if e.names <= known]
+    case.expected = [e for e in near if after_at(case, e.values) < case.before - CLEAR]
+    if isinstance(evidence.spectrum, st.Sweeps) and evidence.thinning == 1:
+        evidence.spectrum.apart = case.session.apart
+    case.places = prints.places(request.model, request.fit.values, evidence)
+    return case
+
+
+@dataclass(frozen=True)
+class Judged:
+    """What a verdict is written from; the fields are those of `Diagnosis` and of `optics.diagnosis.findings`."""
+
+    basis: Basis
+    outcome: Outcome
+    subject: Candidate | None
+    levels: list[Level]
+    fingerprints: list[Fingerprint]
+    families: list[Family]
+    laws: list[Law]
+    splits: list[Split]
+    shifts: list[Shift]
+    findings: Findings
+
+
+def _judge(request: Request, case: Case, chosen: list[Candidate], fits: dict[str, Fit]) -> Judged:
+    """Competition, curves, laws and splits; effects that the competition had refitted are appended to `chosen`."""
+    model, evidence, places = case.model, case.evidence, case.places or []
+    basis = basis_of(model, evidence, evidence.structure(evidence.whitened, evidence.base))
     outcome, levels = held.judge(case, explanations.search(case, chosen, fits))
     outcome = with_rivals(case, outcome)
-    chosen += [c for c in table.order if c.effect.name in fits and c not in chosen]
+    chosen += [c for c in case.table.order if c.effect.name in fits and c not in chosen]
     subject, best = subject_of(case, outcome), outcome.best
 
-    reference = best.fall - best.expectation if subject else max([c.row.net for c in table.order], default=0.0)
-    fingerprints = prints.fingerprints(model, evidence, places, max(reference, 1.0), say)
+    reference = best.fall - best.expectation if subject else max([c.row.net for c in case.table.order], default=0.0)
+    fingerprints = prints.fingerprints(model, evidence, places, max(reference, 1.0), case.say)
     families = prints.families(fingerprints)
     curve = followed(case, subject, best.fit, best.fall - best.expectation, fingerprints)
     if curve:
         outcome, levels = _without_followers(case, outcome, levels, curve.coordinate)
         subject, best = subject_of(case, outcome), outcome.best
     beside = case.session if evidence.is_table else None if best.by_frame else case.lamp
-    laws = other_laws(model, evidence, places, added, variables_of, outcome.scale, beside)
+    laws = other_laws(model, evidence, places, request.added, request.variables_of, outcome.scale, beside)
     splits, chance = _split(case, outcome, subject, basis)
     shifts = held.shifts(case, best.members, best.fit) if subject else []
-
     findings = findings_of(case, outcome, fingerprints, laws, splits, chance, levels, basis)
+    return Judged(basis, outcome, subject, levels, fingerprints, families, laws, splits, shifts, findings)
+
+
+def _written(
+    request: Request,
+    scored: Scored,
+    case: Case,
+    chosen: Sequence[Candidate],
+    fits: dict[str, Fit],
+    judged: Judged,
+) -> Diagnosis:
+    """The word, its conditions, and everything that is said with it."""
+    model, evidence, table = case.model, case.evidence, case.table
+    outcome, subject, findings, basis = judged.outcome, judged.subject, judged.findings, judged.basis
+    best = outcome.best
     word, conditions = decide(findings)
     told = outcome.told()
 
     remarks.write_limits(case, best if word == "CLAIM" else None, basis)
-    remarks.write_verdicts(table, word, subject, outcome, splits)
+    remarks.write_verdicts(table, word, subject, outcome, judged.splits)
     rows, names = [c.row for c in table.order], [c.effect.name for c in chosen]
     gaps, correct = _gaps(case, outcome, chosen)
     ambiguous = list(dict.fromkeys(name for e in told if e.possible for name in e.effects))
@@ -194,11 +262,11 @@ def diagnose(
         kinds.append([findings.fragile])
     hints = remarks.hints_of(word, conditions, outcome, findings, gaps, names)
     if subject and word in NAMED:
-        hints = [*remarks.replaced(case, best, added), *hints]
-    text = sentence(word, conditions, findings, rows, told, fingerprints, levels, shifts, basis)
+        hints = [*remarks.replaced(case, best, request.added), *hints]
+    text = sentence(word, conditions, findings, rows, told, judged.fingerprints, judged.levels, judged.shifts, basis)
     text = " ".join(filter(None, [text, remarks.lamp_text(case, outcome, basis)]))
     if word in ("UNKNOWN", "CANNOT_TELL"):
-        text, first = _unexplained(case, word, text, fingerprints, families, findings, basis)
+        text, first = _unexplained(case, word, text, judged.fingerprints, judged.families, findings, basis)
         hints = [*first, *hints]
     # of one press, what is fixed in the image and what is the surface's own look the same
     if leaves_misfit(best.excess_sd, basis) and not (
@@ -216,21 +284,21 @@ def diagnose(
         compared=names,
         gaps=gaps,
         correct=correct,
-        splits=splits,
-        levels=levels,
-        fingerprints=fingerprints,
-        shifts=shifts,
+        splits=judged.splits,
+        levels=judged.levels,
+        fingerprints=judged.fingerprints,
+        shifts=judged.shifts,
         hints=hints,
-        not_tested={**scored.not_tested, **(excluded or {})},
+        not_tested={**scored.not_tested, **request.excluded},
         warnings=[
             *filter(None, [scored.unsettled]),
-            *remarks.warnings_of(case, word, subject, outcome, shifts, scored.dropped, basis),
+            *remarks.warnings_of(case, word, subject, outcome, judged.shifts, scored.dropped, basis),
         ],
         kinds=kinds if word == "AMBIGUOUS" else [],
         claimed=subject.effect.name if subject and word == "CLAIM" else "",
         explanations=told,
-        families=families,
-        laws=laws,
+        families=judged.families,
+        laws=judged.laws,
         fits=fits,
         evidence=replace(evidence, blocks=[], sigma=[], whitened=[], use=[], candidates=table.order),
     )

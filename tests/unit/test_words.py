@@ -235,7 +235,7 @@ def test_a_model_without_light_misses_no_share_of_it():
     """Its mean may lie below black by rounding: a share of it says nothing."""
     level = {f.name: 0.0 for f in fields(Scored)} | {"scope": {}, "rms": 50.0, "noise": 2.0}
     said = [
-        after_calibration(None, SimpleNamespace(variables=[]), Scored(**level | {"signal": s}))
+        after_calibration(None, SimpleNamespace(variables=[], estimate=[], sd=[]), Scored(**level | {"signal": s}))
         for s in (-1e-9, 100.0, 150.0)
     ]
     assert "sends no light, and misses the images by 50 DN" in said[0][0]

@@ -43,9 +43,8 @@ def test_a_value_far_from_its_prior_is_named():
     near = SimpleNamespace(rms=1.0, signal=100.0)
 
     def told(*depths):
-        fit = SimpleNamespace(
-            variables=variables, values=Values(frame={i: {"gel.press_depth": d} for i, d in enumerate(depths)})
-        )
+        values = Values(frame={i: {"gel.press_depth": d} for i, d in enumerate(depths)})
+        fit = SimpleNamespace(variables=variables, values=values, estimate=depths, sd=[0.01] * len(depths))
         return checks.after_calibration(model, fit, near)
 
     assert told(0.2, 0.34, 0.06) == []
