@@ -30,6 +30,7 @@ from optics.words import p_text, percent
 
 MANY = 3  # effects of one explanation
 DIALS = "dials known"  # of an effect with a strength per frame
+UNPREDICTED = 9.0  # times the chi2 of fitted frames: errors three times as large are no scatter of few frames
 LIGHT = "light"
 HOMOGENEITY = "homogeneity"
 RIVALS = "rivals calibrated"  # of pairs of effects of images, which are dear
@@ -85,6 +86,7 @@ class Findings:
     fragile      an effect that other weights or masks prefer clearly, '' for none
     untried      explanations without the winner that may do better by their scores, and were not refitted, in words
     run_away     a power that has run away from the others, in words (optics.fit.run_away)
+    base_fitted  chi2 per value that the base leaves on fitted frames; base_held_out: on held-out ones, NaN for none
     measured     whether repeats fix the size of the noise
     misstated    whether the excess is that of images whose noise is stated a little too small: without structure
     """
@@ -137,6 +139,8 @@ class Findings:
     priced: float = 0.0
     untried: Sequence[str] = ()
     run_away: str = ""
+    base_fitted: float = math.nan
+    base_held_out: float = math.nan
     measured: bool = False
     misstated: bool = False
 
@@ -163,7 +167,21 @@ class Findings:
 
 
 def decide(f: Findings) -> tuple[str, list[Condition]]:
-    """One of the six words, and the conditions that it rests on."""
+    """One of the six words, and the conditions that it rests on. A model that misses held-out frames by far more than
+    the fitted ones is not as good as the data can tell, whatever the fitted ones say."""
+    word, conditions = _by_fitted(f)
+    if word == "NOTHING" and f.base_held_out > UNPREDICTED * max(f.base_fitted, 1.0):
+        text = (
+            f"chi2 per value is {f.base_held_out:.3g} on held-out frames and {f.base_fitted:.3g} on fitted ones: the "
+            "model does not predict what it was not fitted to. A setting of theirs may be wrong, or a part of the "
+            "range may lack fitted frames"
+        )
+        conditions.append(Condition("held-out frames", f.base_held_out, UNPREDICTED, False, text))
+        return "CANNOT_TELL", conditions
+    return word, conditions
+
+
+def _by_fitted(f: Findings) -> tuple[str, list[Condition]]:
     significant = f.p_family < LEVEL
     conditions = _is_anything_there(f, significant)
     if not significant and not f.structured:

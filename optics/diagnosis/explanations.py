@@ -888,6 +888,7 @@ def noise_of(case: Case, outcome: Outcome, trial: Trial) -> Correlation | None:
 
 def _with_survivors(case: Case, outcome: Outcome) -> Outcome:
     outcome = _survived(case, outcome)
+    outcome.survivors += _under_other_names(outcome)
     outcome.larger = _larger(case, outcome) if outcome.best.members else []
     return outcome
 
@@ -903,6 +904,22 @@ def _larger(case: Case, outcome: Outcome) -> list[Trial]:
             continue
         if t is outcome.leader or not _told(case, outcome, outcome.leader, t):
             found.append(t)
+    return found
+
+
+def _under_other_names(outcome: Outcome) -> list[Trial]:
+    """Explanations that predict the same values as a survivor, and were ruled out by what is plausible alone, where
+    that costs less than NO_TIE: what a strength is counted in, such as the full scale of a meter that reads a
+    thousandth of it, must not choose between names of one law."""
+    alive = [t for t in outcome.survivors if t.members]
+    found = []
+    for t in outcome.trials:
+        if not t.members or t in outcome.survivors or t in outcome.refuted or any(o.keys < t.keys for o in alive):
+            continue
+        same = [o for o in alive if len(o.members) == len(t.members) and abs(o.fall - t.fall) < ALIKE]
+        if any(t.cost < o.cost + NO_TIE and _distance(o, t) < ALIKE for o in same):
+            found.append(t)
+            outcome.leads[t.names] = outcome.leads[t.names][0], NO_TIE
     return found
 
 
@@ -945,6 +962,7 @@ def _survived(case: Case, outcome: Outcome) -> Outcome:
                 outcome.best = outcome.survivors[0]
             else:
                 outcome.survivors.append(rival)
+                outcome.leads[rival.names] = lead, needed
             break
         outcome.shared |= able and lead <= needed and not rival.members
     return outcome

@@ -95,7 +95,9 @@ def findings_of(
             own = replace(own, wander=outcome.wander, wander_p=p, memory=noise.length)
     else:
         own = _of_subject(case, outcome, subject, splits, chance, levels, basis)
+    base = levels[0]
     own = replace(own, measured=measured, misstated=misstated)
+    own = replace(own, base_fitted=base.chi2_fitted, base_held_out=base.chi2_held_out)
     if laws and laws[0].p < LEVEL:
         lead = law_lead(case, outcome, laws[0].score)
         own = replace(own, law=f"{laws[0].effect} along {laws[0].coordinate}", law_lead=lead)

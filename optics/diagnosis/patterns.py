@@ -39,8 +39,9 @@ def fixed_pattern(model: Model, evidence: Evidence, excess: float) -> float:
     """Share of the excess misfit that one gain for each pixel, the same in all frames, explains: dirt, scratches, the
     sensor's own pattern.
 
-    Of pixels that REPEATED frames or more show, less the number of gains, which noise explains; NaN where there are no
-    such pixels, no excess, or readings of a table.
+    Of pixels that REPEATED frames or more show, less what noise explains: the number of gains times chi2 per degree of
+    freedom of what they leave, as in an analysis of variance. Noise that is stated too small has no pattern. NaN where
+    there are no such pixels, no excess, or readings of a table.
     excess   chi2 less its degrees of freedom
     """
     if isinstance(evidence.spectrum, st.Sweeps):
@@ -49,16 +50,20 @@ def fixed_pattern(model: Model, evidence: Evidence, excess: float) -> float:
         float(model.noise.black_level),
         max((int(b.index.max(initial=0)) for b in evidence.blocks), default=0) // evidence.channels + 1,
     )
-    shown, along, length = np.zeros(size), np.zeros(size), np.zeros(size)
+    shown, along, length, square, count = (np.zeros(size) for _ in range(5))
     for block in evidence.blocks:
         pixel, g = block.index // evidence.channels, (block.prediction - black) / block.sigma
         shown += np.bincount(np.unique(pixel), minlength=size)
         along += np.bincount(pixel, g * block.r, size)
         length += np.bincount(pixel, g * g, size)
+        square += np.bincount(pixel, block.r**2, size)
+        count += np.bincount(pixel, minlength=size)
     use = (shown >= REPEATED) & (length > 0)
     if not use.any() or not excess > 0:
         return math.nan
-    return float(np.sum(along[use] ** 2 / length[use]) - use.sum()) * evidence.thinning / excess
+    by_gains, gains = float(np.sum(along[use] ** 2 / length[use])), int(use.sum())
+    left = (float(square[use].sum()) - by_gains) / max(float(count[use].sum()) - gains, 1.0)
+    return (by_gains - gains * max(left, 1.0)) * evidence.thinning / excess
 
 
 def fixed_text(share: float, best: float) -> str:

@@ -22,6 +22,7 @@ from optics.fit.model import value_of
 from optics.scene.declare import Effect
 from optics.words import percent, some, spaced
 
+LONE = 6.0  # sd, by which a reading is off that is named: among ten thousand readings of noise none is
 SLIGHT = 0.05  # rms change over the mean signal, within which images of other effects stay as they were to a twentieth
 RENDER_NOISE = 0.01  # of the camera's variance: Monte Carlo noise above it weakens every test
 SMOOTH = 0.7  # of the noise expected in fine detail: below, neighbouring pixels share their noise
@@ -179,11 +180,15 @@ def warnings_of(
             "interpolated or filtered, or the noise is overstated; neighbouring pixels then share their noise and "
             "p is too small"
         )
-    if abs(basis.excess_sd) > EXCESS and basis.structure_p >= LEVEL:
+    excess, best = basis.chi2 - basis.dof, outcome.best
+    explained = bool(best.members) and table.p_best < LEVEL and best.fall > excess / 2
+    lone = of_one_reading(case, best)
+    if abs(basis.excess_sd) > EXCESS and basis.structure_p >= LEVEL and not (explained or lone):
         texts.append(
             f"chi2 is {basis.phi:.3g} per degree of freedom without structure: the noise model (gain, PRNU) is off "
             "rather than the physics"
         )
+    texts += filter(None, [lone])
     if winner is not None and table.p_best < LEVEL:
         name = winner.effect.name
         for what, other in table.preferred.items():
@@ -201,6 +206,28 @@ def warnings_of(
             + some([moved_by(s) for s in moved], 3)
         )
     return texts
+
+
+def of_one_reading(case: Case, best: Trial) -> str:
+    """A reading that holds more than half of what the best explanation leaves beyond noise: it may have been written
+    down wrongly. '' where none does, and of images."""
+    evidence, frames = case.evidence, [case.model.frames[f] for f in case.evidence.frames]
+    if not evidence.is_table:
+        return ""
+    squares = [np.square(np.asarray(image, float)).reshape(len(image), -1).sum(1) for image in best.images]
+    count = sum(np.asarray(image).size for image in best.images)
+    excess = sum(float(s.sum()) for s in squares) - count
+    k = max(range(len(squares)), key=lambda k: float(squares[k].max()))
+    i, most = int(np.argmax(squares[k])), float(squares[k].max())
+    if excess < EXCESS * math.sqrt(2 * count) or most < max(excess / 2, LONE**2):
+        return ""
+    rows = frames[k].rows
+    number = int(rows[i, 0, 0]) if rows is not None else i
+    at = ", ".join(f"{key} = {values[i, 0, 0]:.5g}" for key, values in list(frames[k].readings.items())[:4])
+    return (
+        f"reading {number} (from 0{'; ' + at if at else ''}) is off by {math.sqrt(most):.2g} sd and holds "
+        f"{min(most / excess, 1.0):.0%} of the excess that is left: check what is written down of it, or take it again"
+    )
 
 
 def lamp_text(case: Case, outcome: Outcome, basis: Basis) -> str:

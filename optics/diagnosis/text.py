@@ -31,7 +31,6 @@ from optics.diagnosis.thresholds import (
     MISSTATED,
     STRENGTH,
     SURE,
-    is_structured,
 )
 from optics.words import (
     ANYWHERE,
@@ -207,7 +206,9 @@ def _nothing(f: Findings, tested: int) -> str:
     tail = (
         f"{wander_text(f)}, as from a lamp whose power wanders, explains the rest "
         f"(structure left: p {p_text(f.wander_p)})"
-        if is_structured(f.structure_p, f.excess_sd) or f.weighed
+        if not math.isnan(f.wander_p)
+        else f"the excess of {f.excess_sd:.2g} sd has no structure, as of a noise that is stated too small"
+        if f.weighed
         else f"no excess misfit is left ({f.excess_sd:.2g} sd)"
         if math.isnan(f.structure_p)
         else f"no structure is left (p {p_text(f.structure_p)})"
@@ -310,10 +311,8 @@ def _ambiguous(f: Findings, explanations: Sequence[Explanation]) -> str:
             f"{'this explanation' if count == 1 else f'{count} explanations'} (fall of chi2): {names}.{other}"
         )
     if count > 1:
-        return (
-            f"the data do not decide between {count} explanations (fall of chi2): {names}. All others are ruled "
-            f"out.{other}"
-        )
+        rest = "" if f.fragile or f.untried else " All others are ruled out."
+        return f"the data do not decide between {count} explanations (fall of chi2): {names}.{rest}{other}"
     if len(kinds[0]) > 1:
         return f"one law explains the residual, under {len(kinds[0])} names (fall of chi2): {names}.{other}"
     return f"the best explanation (fall of chi2) is {names}, but it is not clearly ahead.{other}"

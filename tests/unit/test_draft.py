@@ -92,6 +92,19 @@ def test_the_numbers_of_a_curve_are_those_of_all_values_although_some_found_it()
     assert row.p < 1e-12
 
 
+def test_noise_that_is_stated_too_small_is_no_pattern():
+    """Six frames with noise 1.5 times as large as stated: gains of pixels take a sixth of the excess, and are noise."""
+    model = MockModel(len(FITTED), 24)
+    start, rng = simulate(model, np.random.default_rng(3)), np.random.default_rng(4)
+    for index, frame in enumerate(model.frames):
+        sd = np.sqrt(model.variance(start, index, frame.image))
+        frame.image = frame.image + np.sqrt(1.25) * sd * rng.standard_normal(frame.image.shape)
+    fit = mock_fit(model, model.base_variables(FITTED), start, FITTED)
+    evidence = measure(model, fit.values, fit.variables, [], FITTED, 400_000, 0, lambda *a: None)
+    excess = evidence.projected.chi2 - (evidence.normal.count - evidence.projected.rank)
+    assert excess > 0.8 * evidence.normal.count and abs(fixed_pattern(model, evidence, excess)) < 0.03
+
+
 @pytest.mark.parametrize("pattern", ["scratch", "none", "banding"])
 def test_a_pattern_fixed_in_the_image_is_told_from_a_curve(pattern):
     """A scratch of one pixel's width across the image, dark by 10 % in every frame: no curve along a coordinate is

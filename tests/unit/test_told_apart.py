@@ -239,6 +239,23 @@ def test_what_leaves_an_unnoticed_lamp_is_a_rival_of_gains_of_each_frame(monkeyp
     assert (lead > needed) is ruled_out
 
 
+@pytest.mark.parametrize("cost, values, found", [(22.0, 0.0, True), (40.0, 0.0, False), (22.0, 3.0, False)])
+def test_names_of_one_law_are_not_chosen_by_what_their_strengths_are_counted_in(cost, values, found):
+    """A leak and light past the films predict the same readings. Of a meter that reads a thousandth of its full scale
+    the second looks far from plausible, by 12 in score: it stays. One that predicts other values does not, nor one that
+    is 36 times its plausible size."""
+
+    def trial(name, cost, image):
+        own = {"members": [name], "keys": frozenset({name}), "names": frozenset({name}), "fall": 1523.0, "cost": cost}
+        return SimpleNamespace(**own, images=[np.full(4, image)])
+
+    leak, stray = trial("leak", 10.0, 1.0), trial("stray", cost, 1.0 + values)
+    colours = SimpleNamespace(**{**vars(leak), "keys": frozenset({"leak", "tilt"})})  # contains the leak
+    leads = {stray.names: (cost - 10.0, 10.8)}
+    outcome = SimpleNamespace(trials=[leak, stray, colours], survivors=[leak], refuted=[], leads=leads)
+    assert explanations._under_other_names(outcome) == ([stray] if found else [])
+
+
 @pytest.mark.parametrize("brings, instead", [(2.0, True), (400.0, False)])
 def test_gains_of_each_frame_lead_in_place_of_what_explains_nothing_beside_a_lamp(monkeypatch, brings, instead):
     """Where a lamp that wanders explains all, what leads beside it is the cheapest effect, a tone curve that brings 2
@@ -258,6 +275,20 @@ def test_gains_of_each_frame_lead_in_place_of_what_explains_nothing_beside_a_lam
     outcome = SimpleNamespace(scale=1.0, base=base, leader=curve, trials=[base, curve, gains])
     found = explanations._lamp_or_gains(case, outcome)
     assert found is (gains if instead else None)
+
+
+@pytest.mark.parametrize("off, named", [(100.0, True), (4.0, False), (0.0, False)])
+def test_a_reading_that_holds_the_excess_alone_is_named(off, named):
+    rng = np.random.default_rng(1)
+    images, rows = [rng.standard_normal((30, 1, 1)) for _ in range(2)], np.arange(60).reshape(2, 30, 1, 1)
+    images[1][7] += off
+    turned = {"analyzer.angle": np.linspace(0, 174, 30).reshape(-1, 1, 1)}
+    frames = [SimpleNamespace(rows=r, readings=turned) for r in rows]
+    evidence = SimpleNamespace(is_table=True, frames=[0, 1])
+    case = SimpleNamespace(evidence=evidence, model=SimpleNamespace(frames=frames))
+    text = remarks.of_one_reading(case, SimpleNamespace(images=images))
+    assert text.startswith("reading 37 (from 0; analyzer.angle = 42) is off by 98 sd and holds 100%") is named
+    assert bool(text) is named
 
 
 def test_misfit_that_is_left_beside_gains_of_each_frame_is_counted_without_a_lamp(monkeypatch):

@@ -438,6 +438,9 @@ GOOD = Findings(
         ({"law": "b along frame", "law_lead": SURE + 0.1}, "CLAIM"),
         ({"law": "b along frame", "law_lead": SURE - 0.1}, "AMBIGUOUS"),  # as over any other rival
         ({"unset": "analyzer.angle"}, "AMBIGUOUS"),  # a gain of each frame, or a dial that was off in each
+        # no effect and no structure on the fitted frames, and another world on the others
+        ({"p_family": 0.5, "structure_p": 0.5, "base_fitted": 1.6, "base_held_out": 50.8}, "CANNOT_TELL"),
+        ({"p_family": 0.5, "structure_p": 0.5, "base_fitted": 1.6, "base_held_out": 5.0}, "NOTHING"),
         ({"run_away": "source.power_r 4e+04"}, "CANNOT_TELL"),  # in a light that no lamp sends
         ({"run_away": "source.power_r 4e+04", "common": False, "survivors": 2}, "CANNOT_TELL"),
         ({"adds": 13.0, "priced": 20.4, "structure_p": 0.5, "excess_sd": 1.0}, "NOTHING"),  # a glare of 42 sizes
