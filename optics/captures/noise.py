@@ -435,6 +435,11 @@ def warnings_of(noise: Noise, captures: Captures) -> list[str]:
             and captures.frames[0].image.shape[2] == 3,
             DEMOSAICED,
         ),
+        (
+            captures.values_are == "DN"
+            and any(float(np.nanmax(f.image)) > noise.saturation + 1 for f in captures.frames),
+            f"values above saturation = {noise.saturation:g} DN: no converter gives them; correct [noise] saturation",
+        ),
         (captures.bits == 8, "8 bit: a step of 1 DN hides what is weaker than it; record 10 bit or more"),
         (
             len(captures.frames) == 1,

@@ -68,8 +68,9 @@ class Findings:
                  structure that it leaves; NaN where it does not do
     share        of the excess that the best explanation explains, where excess_sd > EXCESS; curve_share: the best curve
     left         misfit over mean signal with the best explanation
-    uneven       largest h of the winner's splits, by the split uneven_by (in words), uneven_limit allowed; even:
-                 whether all its splits hold; some_even: whether those of any survivor do
+    uneven       largest h of the winner's splits, by the split uneven_by (in words), uneven_limit allowed;
+                 uneven_certain: whether its parts surely differ, by little; even: whether all its splits
+                 hold; some_even: whether those of any survivor do
     held_out     fall on held-out frames, NaN where there are none; p_both: p_winner of the two falls together
     ahead        fall of chi2 on blocks of readings that were left out in turn; NaN for images
     clear        of the winner's strength from none, in standard deviations; NaN where they are unknown
@@ -117,6 +118,7 @@ class Findings:
     uneven: float = 0.0
     uneven_by: str = ""
     uneven_limit: float = UNEVEN
+    uneven_certain: bool = False
     even: bool = True
     some_even: bool = True
     held_out: float = math.nan

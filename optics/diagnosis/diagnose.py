@@ -433,7 +433,8 @@ def _unexplained(
 ) -> tuple[str, list[str]]:
     """(sentence, what to do about patterns of the image) where no effect explains the residual."""
     excess, best = _excess(basis), max([f.share for f in fingerprints], default=0.0)
-    fixed = patterns.fixed_text(patterns.fixed_pattern(case.model, case.evidence, excess), best)
+    share, of_lights = (patterns.fixed_pattern(case.model, case.evidence, excess, each) for each in (False, True))
+    fixed = patterns.fixed_text(share, best, of_lights)
     drift = patterns.drifting_pattern(case.model, case.fit.values, case.evidence, excess, case.seed)
     drifting = patterns.drifting_text(drift)
     found = [part[0].upper() + part[1:] for part in (fixed, drifting) if part]
@@ -442,4 +443,6 @@ def _unexplained(
         parts.append(prints.unexplained(fingerprints, findings.fall, excess))
     if word == "UNKNOWN" and not fixed and not (drifting and drift.share > best):
         parts.append(prints.goes_with(families))
-    return " ".join(filter(None, parts)), [DRIFT_HINT] * bool(drifting) + [FIXED_HINT] * bool(fixed)
+    return " ".join(filter(None, parts)), [DRIFT_HINT] * bool(drifting) + [FIXED_HINT] * (
+        "same in every frame" in fixed
+    )

@@ -24,6 +24,7 @@ from optics.fit.compare import led_label
 from optics.fit.model import Model
 from optics.scene.parameter import Values
 
+NEARLY_ALL = 0.8  # share of the excess: what is fixed in the image is fixed, whatever curve comes near it
 REPEATED = 3  # frames that show a pixel, for a pattern to be called fixed
 SEVERAL = 6  # frames, from which their order can be told from chance: 720 orders
 MANY = 12  # contacts, over which a law is told from what is each contact's own
@@ -35,29 +36,33 @@ AWAY = 2.0  # radii of the contact beyond which a press is not asked about
 ORDERS = 1999  # in which chance could have put the frames
 
 
-def fixed_pattern(model: Model, evidence: Evidence, excess: float) -> float:
+def fixed_pattern(model: Model, evidence: Evidence, excess: float, by_light: bool = False) -> float:
     """Share of the excess misfit that one gain for each pixel, the same in all frames, explains: dirt, scratches, the
     sensor's own pattern.
 
     Of pixels that REPEATED frames or more show, less what noise explains: the number of gains times chi2 per degree of
     freedom of what they leave, as in an analysis of variance. Noise that is stated too small has no pattern. NaN where
     there are no such pixels, no excess, or readings of a table.
-    excess   chi2 less its degrees of freedom
+    excess     chi2 less its degrees of freedom
+    by_light   a gain of its own under each light, and in each channel, which sees a light of its own
     """
     if isinstance(evidence.spectrum, st.Sweeps):
         return math.nan
-    black, size = (
-        float(model.noise.black_level),
-        max((int(b.index.max(initial=0)) for b in evidence.blocks), default=0) // evidence.channels + 1,
-    )
+    black = float(model.noise.black_level)
+    share = 1 if by_light else evidence.channels  # of a pixel's values, those with one gain
+    pixels = max((int(b.index.max(initial=0)) for b in evidence.blocks), default=0) // share + 1
+    labels = [led_label(model.frames[f].parameters) if by_light else "" for f in evidence.frames]
+    lights = {label: n for n, label in enumerate(dict.fromkeys(labels))}
+    size = pixels * len(lights)
     shown, along, length, square, count = (np.zeros(size) for _ in range(5))
-    for block in evidence.blocks:
-        pixel, g = block.index // evidence.channels, (block.prediction - black) / block.sigma
-        shown += np.bincount(np.unique(pixel), minlength=size)
-        along += np.bincount(pixel, g * block.r, size)
-        length += np.bincount(pixel, g * g, size)
-        square += np.bincount(pixel, block.r**2, size)
-        count += np.bincount(pixel, minlength=size)
+    for block, label in zip(evidence.blocks, labels):
+        place = block.index // share + pixels * lights[label]
+        g = (block.prediction - black) / block.sigma
+        shown += np.bincount(np.unique(place), minlength=size)
+        along += np.bincount(place, g * block.r, size)
+        length += np.bincount(place, g * g, size)
+        square += np.bincount(place, block.r**2, size)
+        count += np.bincount(place, minlength=size)
     use = (shown >= REPEATED) & (length > 0)
     if not use.any() or not excess > 0:
         return math.nan
@@ -66,10 +71,19 @@ def fixed_pattern(model: Model, evidence: Evidence, excess: float) -> float:
     return (by_gains - gains * max(left, 1.0)) * evidence.thinning / excess
 
 
-def fixed_text(share: float, best: float) -> str:
-    """One sentence where a fixed pattern explains much more than the best curve does; '' where not."""
-    if not share > max(SHARE, 2 * best):
+def fixed_text(share: float, best: float, by_light: float = math.nan) -> str:
+    """One sentence where a fixed pattern explains nearly all, a quarter more than the best curve does, or twice as much
+    as that; '' where not.
+
+    by_light   share by a gain of its own under each light and in each channel: what a light brings is no dirt"""
+    if not share > max(SHARE, min(2 * best, max(NEARLY_ALL, 1.25 * best))):
         return ""
+    if by_light > share + (1 - min(share, 1.0)) / 2:
+        return (
+            f"one gain for each pixel under each light and in each channel explains {min(by_light, 1.0):.0%} of the "
+            f"excess, one for all of them {min(share, 1.0):.0%}: each light has a pattern of its own, such as a lobe "
+            "of another shape."
+        )
     return (
         f"one gain for each pixel, the same in every frame, explains {min(share, 1.0):.0%} of the excess: dirt, "
         "a scratch or the sensor's own pattern is fixed in the image, whatever curve it resembles."

@@ -234,7 +234,7 @@ def lamp_text(case: Case, outcome: Outcome, basis: Basis) -> str:
     """A sentence on what a lamp did to whole frames, where that is much of the misfit of images: a verdict counts it as
     noise, which its reader would not see. Empty elsewhere, also where there is no excess to share."""
     best = outcome.best
-    if case.evidence.is_table or case.lamp is None or best.by_frame or not best.members:
+    if case.evidence.is_table or case.lamp is None or best.by_frame:
         return ""
     if not basis.excess_sd > EXCESS:
         return ""
@@ -244,10 +244,10 @@ def lamp_text(case: Case, outcome: Outcome, basis: Basis) -> str:
     names = [c.effect.name for c in case.table.order if c.effect.scope == "frame"]
     more = f" If no lamp did that, add {some(names)} and diagnose again." if names else ""
     swing = percent(wander_of(case, outcome, best))
+    frames = "Besides, whole frames" if best.members else "Whole frames"
     return (
-        f"Besides, whole frames are brighter or darker than predicted by {swing} (rms), which is "
-        f"{percent(min(share, 1.0), 2)} of the excess and counts as noise: a lamp or an exposure that changes from "
-        f"frame to frame.{more}"
+        f"{frames} are brighter or darker than predicted by {swing} (rms), which is {percent(min(share, 1.0), 2)} of "
+        f"the excess and counts as noise: a lamp or an exposure that changes from frame to frame.{more}"
     )
 
 
@@ -316,6 +316,8 @@ def hints_of(
             "look at the parts of the data between which its strength differs most (optics view shows what is left of "
             "every frame): what sets them apart is not in the model, or was noted wrongly"
         )
+    if word in ("CANNOT_TELL", "UNKNOWN"):
+        hints.append("optics compare CAPTURES --fit STUDY lists the misfit by frame, by light and by channel")
     if "near" in failed:
         hints.append(f"no effect brings the model near its images: check {AT_FAULT}")
     if CURVE in failed:

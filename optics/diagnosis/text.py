@@ -236,7 +236,7 @@ def _claim(
         lowered = f"held-out misfit from {percent(levels[0].held_out)} to {percent(levels[-1].held_out)}"
     text += (
         f" Adding {'it' if len(best.effects) == 1 else best.name} lowers {lowered} "
-        f"(noise: {percent(basis.noise)}). Its strength is the same in every part of the data."
+        f"(noise: {percent(basis.noise)}). {_alike(f)}"
     )
     others = [] if leaves_misfit(best.excess_sd, basis) else [r for r in rows if r is not row and limits(r)]
     if others:
@@ -245,9 +245,9 @@ def _claim(
     if moved:
         text += " Without it, " + " and ".join(moved_by(s).replace(" by ", " was off by ", 1) for s in moved) + "."
     text += (
-        " With it nothing is left to explain."
+        " With it no excess is left; whether a smaller effect is, the next diagnosis tells."
         if best.complete and len(best.effects) == 1
-        else f" Add it, calibrate and diagnose again: with {best.name} nothing is left to explain."
+        else f" Add it, calibrate and diagnose again: with {best.name} no excess is left."
         if best.complete
         else f" With {best.name} {_left(best)} is left: add it, calibrate and diagnose again."
     )
@@ -255,6 +255,18 @@ def _claim(
         " A lower held-out error verifies the prediction, not the cause. The evidence for the cause is the lead in "
         f"score ({f.lead:.3g}, over {f.against or 'no effect'}), the homogeneity, and that no curve does better."
     )
+
+
+def _alike(f: Findings) -> str:
+    """Whether the strength is the same everywhere: h, the share that splitting it gains, says how far that holds."""
+    if math.isnan(f.uneven):
+        return "It explains too little, or the data have too few parts, to ask whether its strength is the same in all."
+    if f.uneven_certain:
+        return (
+            f"Between parts of the data its strength differs{f.uneven_by}, by less than matters (h {f.uneven:.2g}, "
+            f"{f.uneven_limit:.2g} allowed)."
+        )
+    return "Its strength is the same in every part of the data."
 
 
 def _left(best: Explanation) -> str:

@@ -105,6 +105,21 @@ def test_noise_that_is_stated_too_small_is_no_pattern():
     assert excess > 0.8 * evidence.normal.count and abs(fixed_pattern(model, evidence, excess)) < 0.03
 
 
+@pytest.mark.parametrize(
+    "share, best, by_light, said",
+    [
+        (0.92, 0.52, 0.93, "dirt"),  # a smear, which a coarse map of places explains by half
+        (0.97, 1.0, 0.97, ""),  # bands: a curve along the rows says it with fewer numbers
+        (0.33, 0.14, 0.4, "dirt"),
+        (0.29, 0.14, 0.76, "each light has a pattern of its own"),
+        (0.04, 0.01, 0.04, ""),
+    ],
+)
+def test_what_is_fixed_in_the_image_and_what_a_light_brings(share, best, by_light, said):
+    text = fixed_text(share, best, by_light)
+    assert (said in text) if said else text == ""
+
+
 @pytest.mark.parametrize("pattern", ["scratch", "none", "banding"])
 def test_a_pattern_fixed_in_the_image_is_told_from_a_curve(pattern):
     """A scratch of one pixel's width across the image, dark by 10 % in every frame: no curve along a coordinate is
