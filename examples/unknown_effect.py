@@ -13,8 +13,8 @@ that is what you would type with captures of your own:
     curve
     optics effects new 'row curve' --from study                  the curve as an effect, in a file
     optics add study 'row curve'                                 held-out error falls: the coordinate is right
-    optics effects new 'shutter ripple' --stage lens -o plugins  the cause is found: a stub, and its formula
-    optics calibrate captures -o answer --plugins plugins ...    a fresh study, in which the new effect takes part
+    optics effects new 'shutter ripple' --stage lens -o my_plugins  the cause is found: a stub, and its formula
+    optics calibrate captures -o answer --plugins my_plugins ...    a fresh study, in which the new effect takes part
     optics diagnose answer; optics add answer 'shutter ripple'; optics diagnose answer
 
 OUTPUT gets the captures, both studies with a report each, the images, and `index.html`, which tells the story.

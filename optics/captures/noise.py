@@ -419,6 +419,12 @@ def _prnu(lit: Sequence[tuple[np.ndarray, np.ndarray]], noise: Noise, stride: in
     return math.sqrt(max(square @ light, 0.0) / (light @ light)) if light.any() else 0.0
 
 
+def _brightest(frame: Frame) -> float:
+    """DN, of the pixels that are used; -inf for none."""
+    own = frame.image if frame.mask is None else frame.image[frame.mask]
+    return float(np.max(own, initial=-math.inf, where=np.isfinite(own)))
+
+
 def warnings_of(noise: Noise, captures: Captures) -> list[str]:
     """What about the camera and the frames weakens a verdict, in sentences."""
     found = [
@@ -437,7 +443,8 @@ def warnings_of(noise: Noise, captures: Captures) -> list[str]:
         ),
         (
             captures.values_are == "DN"
-            and any(float(np.nanmax(f.image)) > noise.saturation + 1 for f in captures.frames),
+            and noise.ends
+            and any(_brightest(f) > noise.saturation + 1 for f in captures.frames),
             f"values above saturation = {noise.saturation:g} DN: no converter gives them; correct [noise] saturation",
         ),
         (captures.bits == 8, "8 bit: a step of 1 DN hides what is weaker than it; record 10 bit or more"),

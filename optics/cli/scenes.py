@@ -202,18 +202,19 @@ def _new_effect(name: str | None, plugins: Sequence[Path] | None, **given: Any) 
         stage = draft.stage_of(given["part"], given["stage"])
         draft.check_name(name, STAGES[stage], registry)
         text, folder = draft.new_effect(name, stage), plugins[0] if plugins else Path("plugins")
-        if not given["o"] and folder.resolve() == shipped("plugins").resolve():
-            raise ValueError(
-                f"optics effects new: {folder} is the folder of the plugins that ship; name one of your own, such as "
-                "-o my_plugins"
-            )
     else:
         if given["stage"] or given["part"]:
             raise ValueError(
                 "--stage, --part: a draft acts where its coordinate is known; leave them out, or leave --from out"
             )
         text, folder = draft.from_study(given["from"], given["along"], name, plugins)
-    file = draft.write(text, given["o"] or folder, name)
+    folder = Path(given["o"] or folder)
+    if folder.resolve().is_relative_to(shipped("plugins").resolve()):
+        raise ValueError(
+            f"optics effects new: {folder} belongs to the plugins that ship; name a folder of your own, such as "
+            "-o my_plugins"
+        )
+    file = draft.write(text, folder, name)
     terminal.note(
         f"next: optics add {given['from']} '{name}', then put a formula in place of the table"
         if given["from"]

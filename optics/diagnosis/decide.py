@@ -31,6 +31,7 @@ from optics.words import p_text, percent
 MANY = 3  # effects of one explanation
 DIALS = "dials known"  # of an effect with a strength per frame
 UNPREDICTED = 9.0  # times the chi2 of fitted frames: errors three times as large are no scatter of few frames
+PREDICTS = "held-out frames"
 LIGHT = "light"
 HOMOGENEITY = "homogeneity"
 RIVALS = "rivals calibrated"  # of pairs of effects of images, which are dear
@@ -178,7 +179,7 @@ def decide(f: Findings) -> tuple[str, list[Condition]]:
             "model does not predict what it was not fitted to. A setting of theirs may be wrong, or a part of the "
             "range may lack fitted frames"
         )
-        conditions.append(Condition("held-out frames", f.base_held_out, UNPREDICTED, False, text))
+        conditions.append(Condition(PREDICTS, f.base_held_out, UNPREDICTED, False, text))
         return "CANNOT_TELL", conditions
     return word, conditions
 

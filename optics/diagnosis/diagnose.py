@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -433,8 +434,8 @@ def _unexplained(
 ) -> tuple[str, list[str]]:
     """(sentence, what to do about patterns of the image) where no effect explains the residual."""
     excess, best = _excess(basis), max([f.share for f in fingerprints], default=0.0)
-    share, of_lights = (patterns.fixed_pattern(case.model, case.evidence, excess, each) for each in (False, True))
-    fixed = patterns.fixed_text(share, best, of_lights)
+    pattern = partial(patterns.fixed_pattern, case.model, case.evidence, excess)
+    fixed = patterns.fixed_text(pattern(), best, pattern(True), pattern(True, True))
     drift = patterns.drifting_pattern(case.model, case.fit.values, case.evidence, excess, case.seed)
     drifting = patterns.drifting_text(drift)
     found = [part[0].upper() + part[1:] for part in (fixed, drifting) if part]

@@ -916,6 +916,8 @@ def _under_other_names(outcome: Outcome) -> list[Trial]:
     for t in outcome.trials:
         if not t.members or t in outcome.survivors or t in outcome.refuted or any(o.keys < t.keys for o in alive):
             continue
+        if outcome.shared and not _adds_to_noise(t, outcome.base):
+            continue
         same = [o for o in alive if len(o.members) == len(t.members) and abs(o.fall - t.fall) < ALIKE]
         if any(t.cost < o.cost + NO_TIE and _distance(o, t) < ALIKE for o in same):
             found.append(t)

@@ -212,7 +212,7 @@ def _of_subject(
         uneven=worst.h if worst else math.nan,
         uneven_by=f" by {worst.by} ({_extremes(worst)})" if worst else "",
         uneven_limit=worst.limit if worst else UNEVEN,
-        uneven_certain=worst is not None and max(worst.p, worst.chance) < LEVEL,
+        uneven_certain=any(s.p < LEVEL and s.chance < LEVEL for s in mine),
         even=all(s.holds for s in mine),
         some_even=any(even) if even else True,
         held_out=held_out,

@@ -25,6 +25,7 @@ from optics.fit.model import Model
 from optics.scene.parameter import Values
 
 NEARLY_ALL = 0.8  # share of the excess: what is fixed in the image is fixed, whatever curve comes near it
+MORE = 0.1  # share of the excess, by which further gains must explain more to be the pattern's own
 REPEATED = 3  # frames that show a pixel, for a pattern to be called fixed
 SEVERAL = 6  # frames, from which their order can be told from chance: 720 orders
 MANY = 12  # contacts, over which a law is told from what is each contact's own
@@ -36,27 +37,35 @@ AWAY = 2.0  # radii of the contact beyond which a press is not asked about
 ORDERS = 1999  # in which chance could have put the frames
 
 
-def fixed_pattern(model: Model, evidence: Evidence, excess: float, by_light: bool = False) -> float:
+def fixed_pattern(
+    model: Model, evidence: Evidence, excess: float, by_channel: bool = False, by_light: bool = False
+) -> float:
     """Share of the excess misfit that one gain for each pixel, the same in all frames, explains: dirt, scratches, the
     sensor's own pattern.
 
     Of pixels that REPEATED frames or more show, less what noise explains: the number of gains times chi2 per degree of
     freedom of what they leave, as in an analysis of variance. Noise that is stated too small has no pattern. NaN where
     there are no such pixels, no excess, or readings of a table.
-    excess     chi2 less its degrees of freedom
-    by_light   a gain of its own under each light, and in each channel, which sees a light of its own
+    excess       chi2 less its degrees of freedom
+    by_channel   a gain of its own in each channel;   by_light: under each light too, NaN where there is one light, or
+                 where pixels are thinned by frames, so that one under one light is not the same under another
     """
     if isinstance(evidence.spectrum, st.Sweeps):
         return math.nan
     black = float(model.noise.black_level)
-    share = 1 if by_light else evidence.channels  # of a pixel's values, those with one gain
+    share = 1 if by_channel else evidence.channels  # of a pixel's values, those with one gain
     pixels = max((int(b.index.max(initial=0)) for b in evidence.blocks), default=0) // share + 1
-    labels = [led_label(model.frames[f].parameters) if by_light else "" for f in evidence.frames]
-    lights = {label: n for n, label in enumerate(dict.fromkeys(labels))}
-    size = pixels * len(lights)
+    lights = {""}
+    if by_light:
+        lights = {led_label(model.frames[f].parameters) for f in evidence.frames}
+        if len(lights) < 2 or evidence.thinning > 1:
+            return math.nan
+    order = {label: n for n, label in enumerate(sorted(lights))}
+    size = pixels * len(order)
     shown, along, length, square, count = (np.zeros(size) for _ in range(5))
-    for block, label in zip(evidence.blocks, labels):
-        place = block.index // share + pixels * lights[label]
+    for block in evidence.blocks:
+        label = led_label(model.frames[block.frame].parameters) if by_light else ""
+        place = block.index // share + pixels * order[label]
         g = (block.prediction - black) / block.sigma
         shown += np.bincount(np.unique(place), minlength=size)
         along += np.bincount(place, g * block.r, size)
@@ -71,21 +80,31 @@ def fixed_pattern(model: Model, evidence: Evidence, excess: float, by_light: boo
     return (by_gains - gains * max(left, 1.0)) * evidence.thinning / excess
 
 
-def fixed_text(share: float, best: float, by_light: float = math.nan) -> str:
+def fixed_text(share: float, best: float, by_channel: float = math.nan, by_light: float = math.nan) -> str:
     """One sentence where a fixed pattern explains nearly all, a quarter more than the best curve does, or twice as much
     as that; '' where not.
 
-    by_light   share by a gain of its own under each light and in each channel: what a light brings is no dirt"""
-    if not share > max(SHARE, min(2 * best, max(NEARLY_ALL, 1.25 * best))):
+    by_channel, by_light   shares by gains of each channel, and of each light too: what a light brings is no dirt"""
+
+    def beyond(more: float, less: float) -> bool:
+        return more > less + max((1 - min(less, 1.0)) / 2, MORE)
+
+    most = np.nanmax([share, by_channel]) if not math.isnan(share) else share
+    if not most > max(SHARE, min(2 * best, max(NEARLY_ALL, 1.25 * best))):
         return ""
-    if by_light > share + (1 - min(share, 1.0)) / 2:
+    if beyond(by_light, most):
         return (
-            f"one gain for each pixel under each light and in each channel explains {min(by_light, 1.0):.0%} of the "
-            f"excess, one for all of them {min(share, 1.0):.0%}: each light has a pattern of its own, such as a lobe "
-            "of another shape."
+            f"one gain for each pixel under each light explains {min(by_light, 1.0):.0%} of the excess, one for all "
+            f"lights {min(most, 1.0):.0%}: each light has a pattern of its own, such as a lobe of another shape."
+        )
+    if beyond(by_channel, share):
+        return (
+            f"one gain for each pixel in each channel, the same in every frame, explains {min(by_channel, 1.0):.0%} of "
+            f"the excess, one for all channels {min(share, 1.0):.0%}: the sensor's own pattern, dirt of one colour, or "
+            "the pattern of a light that one channel alone sees."
         )
     return (
-        f"one gain for each pixel, the same in every frame, explains {min(share, 1.0):.0%} of the excess: dirt, "
+        f"one gain for each pixel, the same in every frame, explains {min(most, 1.0):.0%} of the excess: dirt, "
         "a scratch or the sensor's own pattern is fixed in the image, whatever curve it resembles."
     )
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from optics.captures import noise as camera_noise
 from optics.diagnosis import statistics as st
-from optics.diagnosis.decide import CURVE, HOMOGENEITY, Findings
+from optics.diagnosis.decide import CURVE, HOMOGENEITY, PREDICTS, Findings
 from optics.diagnosis.evidence import Candidate, Evidence, at_bound, measure, priors
 from optics.diagnosis.explanations import Outcome, Trial, wander_of
 from optics.diagnosis.refit import Case
@@ -181,7 +181,7 @@ def warnings_of(
             "p is too small"
         )
     excess, best = basis.chi2 - basis.dof, outcome.best
-    explained = bool(best.members) and table.p_best < LEVEL and best.fall > excess / 2
+    explained = bool(best.members) and table.p_best < LEVEL and best.fall > excess / 2 > 0
     lone = of_one_reading(case, best)
     if abs(basis.excess_sd) > EXCESS and basis.structure_p >= LEVEL and not (explained or lone):
         texts.append(
@@ -215,7 +215,7 @@ def of_one_reading(case: Case, best: Trial) -> str:
     if not evidence.is_table:
         return ""
     squares = [np.square(np.asarray(image, float)).reshape(len(image), -1).sum(1) for image in best.images]
-    count = sum(np.asarray(image).size for image in best.images)
+    count = sum(int(np.asarray(use).sum()) for use in evidence.use)
     excess = sum(float(s.sum()) for s in squares) - count
     k = max(range(len(squares)), key=lambda k: float(squares[k].max()))
     i, most = int(np.argmax(squares[k])), float(squares[k].max())
@@ -307,6 +307,8 @@ def hints_of(
             )
     if "spread" in failed:
         hints.append(f"repeat {findings.carried_by}: nearly all of the fall of chi2 comes from it")
+    if PREDICTS in failed:
+        hints.append("check what is written down of the held-out frames, or hold out others (--hold-out)")
     if "held out" in failed and word != "NOTHING":
         hints.append(
             "hold out other frames (other presses or positions), or find why the held-out frames do not improve"

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from optics.diagnosis.decide import CURVE, HOMOGENEITY, Findings, wander_text
+from optics.diagnosis.decide import CURVE, HOMOGENEITY, PREDICTS, Findings, wander_text
 from optics.diagnosis.result import (
     NAMED,
     PLANS,
@@ -167,6 +167,8 @@ def sentence(
         )
     if word == "UNKNOWN":
         return _unknown(f, next(c for c in fingerprints if c.coordinate == f.coordinate), basis)
+    if word == "CANNOT_TELL" and (missed := [c for c in failing if c.name == PREDICTS]):
+        return f"nothing is missing in the frames that were fitted, but {missed[0].text}."
     if word == "CANNOT_TELL":
         last = [c for c in failing if c.name == CURVE]  # says more than all others together
         reasons = "; ".join(f"{c.name}: {c.text}" for c in last or failing) or "; ".join(c.text for c in conditions)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from optics.fit.model import Model
 from optics.fit.result import Fit
+from optics.scene.parameter import Variable
 
 # times the least of the others: bands of one lamp, or lamps of one kind, differ by ten, and powers that ran away by 800
 APART = 100.0
@@ -25,9 +26,19 @@ def powers_apart(model: Model, found: Fit) -> str:
         for v, value, sd in zip(found.variables, found.estimate, found.sd)
         if v.frames is None and v.prior is None and model.linear_in(v) and 0 <= sd < KNOWN * value
     ]
-    if len(powers) < 2:
+    pairs = [
+        (value / other, value, v, o)
+        for value, sd, v in powers
+        for other, well, o in powers
+        if _of_a_kind(v, o) and value > APART * other and sd > APART * well
+    ]
+    if not pairs:
         return ""
-    least, well, other = min(powers, key=lambda p: p[0])
-    most, badly, v = max(powers, key=lambda p: p[0])
-    apart = most > APART * least and badly > APART * well
-    return f"{v.name} {most:.3g}, {most / least:.2g} times {other.name}" if apart else ""
+    times, most, v, other = max(pairs, key=lambda p: (p[1], p[0]))
+    return f"{v.name} {most:.3g}, {times:.2g} times {other.name}"
+
+
+def _of_a_kind(one: Variable, other: Variable) -> bool:
+    """Whether two powers are counted alike: shares of bands in one light, or the same number of lights of one kind."""
+    a, b = (v.keys[0].rpartition(".") for v in (one, other))
+    return one.parameter.role == other.parameter.role and (a[0] == b[0] or one.parameter.doc == other.parameter.doc)

@@ -106,18 +106,43 @@ def test_noise_that_is_stated_too_small_is_no_pattern():
 
 
 @pytest.mark.parametrize(
-    "share, best, by_light, said",
+    "share, best, by_channel, by_light, said",
     [
-        (0.92, 0.52, 0.93, "dirt"),  # a smear, which a coarse map of places explains by half
-        (0.97, 1.0, 0.97, ""),  # bands: a curve along the rows says it with fewer numbers
-        (0.33, 0.14, 0.4, "dirt"),
-        (0.29, 0.14, 0.76, "each light has a pattern of its own"),
-        (0.04, 0.01, 0.04, ""),
+        (0.92, 0.52, 0.93, 0.93, "dirt"),  # a smear, which a coarse map of places explains by half
+        (0.97, 1.0, 0.97, 0.97, ""),  # bands: a curve along the rows says it with fewer numbers
+        (0.33, 0.14, 0.36, 0.4, "dirt"),
+        (0.29, 0.14, 0.3, 0.76, "each light has a pattern of its own"),
+        (0.32, 0.14, 0.99, 1.0, "in each channel"),  # a pattern of the sensor, different in each channel
+        (0.32, 0.14, 0.99, np.nan, "in each channel"),
+        (0.04, 0.01, 0.04, 0.04, ""),
+        (np.nan, 0.01, np.nan, np.nan, ""),
     ],
 )
-def test_what_is_fixed_in_the_image_and_what_a_light_brings(share, best, by_light, said):
-    text = fixed_text(share, best, by_light)
+def test_what_is_fixed_in_the_image_and_what_a_light_brings(share, best, by_channel, by_light, said):
+    text = fixed_text(share, best, by_channel, by_light)
     assert (said in text) if said else text == ""
+
+
+@pytest.mark.parametrize("pattern", ["of pixels", "of channels", "of lights"])
+def test_patterns_of_pixels_channels_and_lights_are_told_apart(pattern):
+    """30 frames, each under one of three LEDs, with a gain of 3 % (rms) of each pixel, of each pixel and channel, or of
+    each pixel under each LED."""
+    frames = list(range(30))
+    model, rng = MockModel(len(frames), 16), np.random.default_rng(3)
+    start = simulate(model, rng)
+    gains = 1 + 0.03 * rng.standard_normal((3, 16, 16, 3))
+    for n, frame in enumerate(model.frames[: len(frames)]):
+        own = {"of pixels": gains[0, ..., :1], "of channels": gains[0], "of lights": gains[n % 3, ..., :1]}[pattern]
+        frame.image = 8 + own * (frame.image - 8)
+        frame.parameters = {f"led_{n % 3}.power": 1.0}
+    fit = mock_fit(model, model.base_variables(frames), start, frames)
+    evidence = measure(model, fit.values, fit.variables, [], frames, 400_000, 0, lambda *a: None)
+    excess = evidence.projected.chi2 - (evidence.normal.count - evidence.projected.rank)
+    shares = [fixed_pattern(model, evidence, excess, *by) for by in ((), (True,), (True, True))]
+    said = {"of pixels": "every frame, explains", "of channels": "in each channel", "of lights": "under each light"}
+    assert said[pattern] in fixed_text(shares[0], 0.02, *shares[1:]), shares
+    thinned = replace(evidence, thinning=3)
+    assert np.isnan(fixed_pattern(model, thinned, excess, True, True))
 
 
 @pytest.mark.parametrize("pattern", ["scratch", "none", "banding"])

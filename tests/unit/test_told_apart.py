@@ -252,7 +252,7 @@ def test_names_of_one_law_are_not_chosen_by_what_their_strengths_are_counted_in(
     leak, stray = trial("leak", 10.0, 1.0), trial("stray", cost, 1.0 + values)
     colours = SimpleNamespace(**{**vars(leak), "keys": frozenset({"leak", "tilt"})})  # contains the leak
     leads = {stray.names: (cost - 10.0, 10.8)}
-    outcome = SimpleNamespace(trials=[leak, stray, colours], survivors=[leak], refuted=[], leads=leads)
+    outcome = SimpleNamespace(trials=[leak, stray, colours], survivors=[leak], refuted=[], leads=leads, shared=False)
     assert explanations._under_other_names(outcome) == ([stray] if found else [])
 
 
@@ -284,7 +284,7 @@ def test_a_reading_that_holds_the_excess_alone_is_named(off, named):
     images[1][7] += off
     turned = {"analyzer.angle": np.linspace(0, 174, 30).reshape(-1, 1, 1)}
     frames = [SimpleNamespace(rows=r, readings=turned) for r in rows]
-    evidence = SimpleNamespace(is_table=True, frames=[0, 1])
+    evidence = SimpleNamespace(is_table=True, frames=[0, 1], use=[np.ones((30, 1, 1), bool)] * 2)
     case = SimpleNamespace(evidence=evidence, model=SimpleNamespace(frames=frames))
     text = remarks.of_one_reading(case, SimpleNamespace(images=images))
     assert text.startswith("reading 37 (from 0; analyzer.angle = 42) is off by 98 sd and holds 100%") is named

@@ -283,6 +283,6 @@ def test_a_claim_beside_much_misfit_rules_nothing_out(left, told):
         units=[],
     )
     levels = [SimpleNamespace(held_out=0.05), SimpleNamespace(held_out=0.02)]
-    f = SimpleNamespace(lead=100.0, against="leak")
+    f = SimpleNamespace(lead=100.0, against="leak", uneven=0.001, uneven_certain=False)
     text = _claim(f, claimed, [claimed, other], [best], levels, [], basis)
     assert ("Upper limits of other effects: leak" in text) is told
