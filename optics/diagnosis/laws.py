@@ -52,13 +52,14 @@ def other_laws(
         return []
     turned = prints.settings(model, evidence)
     unknown = _frame_by_frame(model, evidence, turned)
+    swept = {key for f in evidence.frames for key in model.frames[f].readings}
     common = set.intersection(*[set(p) for p in places])
     judge = _fall_of_readings(evidence, session, scale) if session is not None else _fall_of_images(evidence)
     found = []
     for effect in added:
         keys = {key for v in variables_of(effect) for key in v.keys}
         own = [i for i in evidence.base if keys & set(evidence.columns[i].keys)]
-        along = {*effect.acts, *((*turned, *ALWAYS) if evidence.is_table else ())}
+        along = {*effect.acts, *((*swept, *ALWAYS) if evidence.is_table else ())}
         for coordinate in sorted((along & common) - {*MIMICS} - unknown) if own else []:
             x = np.concatenate([p[coordinate] for p in places])
             laws = []

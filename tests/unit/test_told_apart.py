@@ -484,6 +484,24 @@ def test_a_law_along_a_dial_of_unknown_errors_is_a_strength_of_each_frame(monkey
     assert laws._frame_by_frame(SimpleNamespace(), evidence, turned) == held
 
 
+def test_a_freer_law_runs_along_what_each_reading_was_set_to(monkeypatch):
+    """A polarizer that was bumped in mid-session is off by another angle from then on: a law of the session's clock."""
+    monkeypatch.setattr(laws.prints, "settings", lambda model, evidence: {})  # of frames: a sweep has one value of none
+    monkeypatch.setattr(laws, "_strengths", lambda evidence, own, x: iter([[x[:, None]]]))
+    monkeypatch.setattr(laws, "_fall_of_images", lambda evidence: lambda images: (50.0, 2, 50.0))
+    coordinates = ("analyzer.angle", "source.time", "camera.exposure", "intensity", "reading")
+    places = [dict.fromkeys(coordinates, np.arange(9.0))]
+    frames = [SimpleNamespace(readings=dict.fromkeys(("analyzer.angle", "source.time"), np.zeros((9, 1, 1))))]
+    evidence = SimpleNamespace(
+        is_table=True, frames=[0], base=[0], columns=[SimpleNamespace(keys=("polarizer.offset",))]
+    )
+    variable = SimpleNamespace(keys=("polarizer.offset",))
+    effect = SimpleNamespace(name="polarizer misalignment", acts=("analyzer.angle",))
+    model = SimpleNamespace(frames=frames)
+    found = laws.other_laws(model, evidence, places, [effect], lambda e: [variable], 1.0, None)
+    assert {law.coordinate for law in found} == {"analyzer.angle", "source.time", "intensity"}
+
+
 def test_a_law_falls_from_where_effects_fall():
     """By what readings share they have other weights than the fit had, so that a base stands off its optimum. An effect
     falls from there, and another law of the same image falls as far."""
