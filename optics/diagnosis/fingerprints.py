@@ -29,6 +29,7 @@ SIDE = 4  # cells per side of the coordinate 'place': a finer map would fit any 
 NOT_A_COORDINATE = {"far", "quadrant"}  # regions that others make up
 YES_NO = ("contact", "shadow", "rim")
 PER_BIN = 4  # readings per bin, at least: a gain and an offset are fitted to them
+IN_PIXELS = {"px": 1.0, "DN/px": -1.0, "DN/px^2": -2.0}  # unit -> its power of a length in pixels
 LINES = 64  # bins of 'row', 'column' and 'reading': a shutter, a read-out or an unsteady lamp acts on single rows
 GRAIN = 2.0  # px: width of the Gaussian that takes the noise off a measured background
 # Share of a curve's direction that calibration must leave for it to be drawn; the rest (a level, a slope) is unknown.
@@ -62,8 +63,9 @@ def family_of(coordinate: str, of_setting: str = "") -> str:
 
 # -- covariates ------------------------------------------------------------------------------------------------------
 def places(model: Model, values: Values, evidence: Evidence) -> list[dict[str, np.ndarray]]:
-    """Per block, {coordinate: (n,) of its values}: of the model, of the prediction, of any image, and settings."""
-    found = []
+    """Per block, {coordinate: (n,) of its values}: of the model, of the prediction, of any image, and settings. What is
+    counted in pixels is in those of the camera, also of a model in cells."""
+    found, cell = [], getattr(model, "cell", 1)
     order = {frame: i for i, frame in enumerate(evidence.frames)}
     turned = settings(model, evidence)
     lights = [led_label(model.frames[f].parameters) for f in evidence.frames]
@@ -95,6 +97,9 @@ def places(model: Model, values: Values, evidence: Evidence) -> list[dict[str, n
         )
         if len(kinds) > 1:
             known["LED"] = np.full(len(row), kinds.index(lights[order[block.frame]]), np.float32)
+        for name in known.keys() & UNITS.keys() if cell > 1 else ():
+            middle = (cell - 1) / 2 if name in ("row", "column") else 0.0
+            known[name] = np.float32(cell ** IN_PIXELS.get(UNITS[name], 0)) * known[name] + np.float32(middle)
         if min(shape[:2]) >= 2 * SIDE:
             known["place"] = (row * SIDE // shape[0] * SIDE + column * SIDE // shape[1]).astype(np.float32)
         found.append(known)

@@ -68,6 +68,7 @@ class SceneModel:
                 f"{captures.folder}: no noise model; give [noise] in captures.toml or repeats to estimate it from"
             )
         self.cut_off = False  # whether readings of 0 are limits
+        self.cell = 1  # px each way of the camera's image, of which one value here is the mean (optics.study.cells)
         self.assumed_errors: dict[str, float] = {}  # of settings, besides those that the captures state
         # settings whose error is stated, be it none
         self.stated_errors = {*captures.uncertainty, *(key for f in captures.frames for key in f.uncertainty)}

@@ -138,7 +138,7 @@ def open_in_cells(setup: Setup, cells: Cells) -> tuple[SceneModel, Setup]:
         loaded = Scene(whole.scene.path, defines, whole.scene.variant, whole.scene.registry)
     loaded.parameters = {k: replace(p, unit=IN_CELLS.get(p.unit, p.unit)) for k, p in loaded.parameters.items()}
     model = type(whole)(loaded, captures, captures.noise, whole.flat_field, whole.region)
-    model.assumed_errors = dict(whole.assumed_errors)
+    model.assumed_errors, model.cell = dict(whole.assumed_errors), cells.k
     if whole.recipe is not None:
         model.recipe = partial(_open_again, whole.recipe, setup, cells.k)
     return model, replace(setup, values=cells.all_into(setup.values))

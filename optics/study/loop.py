@@ -452,7 +452,11 @@ def _expected(record: Record, model: SceneModel, cells: Cells | None) -> list[Ex
 
 
 def cells_of(record: Record, model: SceneModel) -> Cells | None:
-    """The cells in which the last step is diagnosed; None: in pixels."""
+    """The cells in which the last step is diagnosed; None: in pixels, as where somebody's own effect may count them."""
+    own = {str(file) for file in model.scene.registry.own_files}
+    tested = [*candidates(model, record), *effects_of(record, model.scene.registry)]
+    if any(str(Path(e.file).resolve()) in own and {"lens", "sensor"} & set(e.stages) for e in tested):
+        return None
     variables, _, fitted = kept(record, model)
     return cells_for(model, fitted, variables)
 

@@ -92,6 +92,21 @@ def test_the_numbers_of_a_curve_are_those_of_all_values_although_some_found_it()
     assert row.p < 1e-12
 
 
+def test_coordinates_of_a_model_in_cells_are_in_pixels_of_the_camera():
+    """Of cells of 3 x 3 px the first lies about row 1, the second about row 4; a steepness per cell is three per px."""
+    model = MockModel(len(FITTED), 24)
+    start = simulate(model, np.random.default_rng(3))
+    fit = mock_fit(model, model.base_variables(FITTED), start, FITTED)
+    evidence = measure(model, fit.values, fit.variables, [], FITTED, 400_000, 0, lambda *a: None)
+    whole = places(model, fit.values, evidence)[0]
+    model.cell = 3
+    coarse = places(model, fit.values, evidence)[0]
+    for name in ("row", "column"):
+        assert coarse[name] == pytest.approx(3 * whole[name] + 1)
+    for name, power in (("radius", 1), ("gradient", -1), ("laplacian", -2), ("signal", 0), ("place", 0)):
+        assert coarse[name] == pytest.approx(3.0**power * whole[name], rel=1e-6, nan_ok=True)
+
+
 def test_noise_that_is_stated_too_small_is_no_pattern():
     """Six frames with noise 1.5 times as large as stated: gains of pixels take a sixth of the excess, and are noise."""
     model = MockModel(len(FITTED), 24)
