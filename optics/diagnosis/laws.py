@@ -28,7 +28,7 @@ from optics.scene.parameter import Variable
 
 ORDERS = (2, 4, 8)  # cosines of a law, the first that score best
 PER_NUMBER = 4  # values per number that is fitted, at least
-ALWAYS = ("intensity", "channel")  # coordinates of readings that every law may run along, besides the settings
+ALWAYS = ("intensity", "channel")  # coordinates of readings that every law may run along, besides clocks
 
 Judge = Callable[[Sequence[np.ndarray]], tuple[float, int, float]]
 
@@ -52,14 +52,15 @@ def other_laws(
         return []
     turned = prints.settings(model, evidence)
     unknown = _frame_by_frame(model, evidence, turned)
-    swept = {key for f in evidence.frames for key in model.frames[f].readings}
+    # of what was set, effects of the library differ in how they depend on it; what happened meanwhile is no effect
+    clocks = {k for f in evidence.frames for k in model.frames[f].readings if model.parameters[k].role == "clock"}
     common = set.intersection(*[set(p) for p in places])
     judge = _fall_of_readings(evidence, session, scale) if session is not None else _fall_of_images(evidence)
     found = []
     for effect in added:
         keys = {key for v in variables_of(effect) for key in v.keys}
         own = [i for i in evidence.base if keys & set(evidence.columns[i].keys)]
-        along = {*effect.acts, *((*swept, *ALWAYS) if evidence.is_table else ())}
+        along = {*effect.acts, *((*clocks, *ALWAYS) if evidence.is_table else ())}
         for coordinate in sorted((along & common) - {*MIMICS} - unknown) if own else []:
             x = np.concatenate([p[coordinate] for p in places])
             laws = []

@@ -484,20 +484,23 @@ def test_a_law_along_a_dial_of_unknown_errors_is_a_strength_of_each_frame(monkey
     assert laws._frame_by_frame(SimpleNamespace(), evidence, turned) == held
 
 
-def test_a_freer_law_runs_along_what_each_reading_was_set_to(monkeypatch):
-    """A polarizer that was bumped in mid-session is off by another angle from then on: a law of the session's clock."""
+def test_a_freer_law_runs_along_the_clock_of_a_session(monkeypatch):
+    """A polarizer that was bumped in mid-session is off by another angle from then on. Along the power no law runs:
+    light past the films with a strength that changes with it is a leak, of which the library has the name."""
     monkeypatch.setattr(laws.prints, "settings", lambda model, evidence: {})  # of frames: a sweep has one value of none
     monkeypatch.setattr(laws, "_strengths", lambda evidence, own, x: iter([[x[:, None]]]))
     monkeypatch.setattr(laws, "_fall_of_images", lambda evidence: lambda images: (50.0, 2, 50.0))
-    coordinates = ("analyzer.angle", "source.time", "camera.exposure", "intensity", "reading")
+    coordinates = ("analyzer.angle", "source.time", "source.power", "intensity", "reading")
     places = [dict.fromkeys(coordinates, np.arange(9.0))]
-    frames = [SimpleNamespace(readings=dict.fromkeys(("analyzer.angle", "source.time"), np.zeros((9, 1, 1))))]
+    frames = [SimpleNamespace(readings=dict.fromkeys(coordinates[:3], np.zeros((9, 1, 1))))]
     evidence = SimpleNamespace(
         is_table=True, frames=[0], base=[0], columns=[SimpleNamespace(keys=("polarizer.offset",))]
     )
     variable = SimpleNamespace(keys=("polarizer.offset",))
     effect = SimpleNamespace(name="polarizer misalignment", acts=("analyzer.angle",))
-    model = SimpleNamespace(frames=frames)
+    roles = {"analyzer.angle": "angle", "source.time": "clock", "source.power": "power"}
+    parameters = {key: SimpleNamespace(role=role) for key, role in roles.items()}
+    model = SimpleNamespace(frames=frames, parameters=parameters)
     found = laws.other_laws(model, evidence, places, [effect], lambda e: [variable], 1.0, None)
     assert {law.coordinate for law in found} == {"analyzer.angle", "source.time", "intensity"}
 
