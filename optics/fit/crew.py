@@ -363,6 +363,8 @@ class Hands:
 
         Processes that share the frames of a press each move its geometry: where Dr.Jit keeps the cores busy, they take
         half as long again as one process (six LEDs of one press on two cores)."""
+        if not frames:
+            return None
         if len(frames) == 1:  # is made where its images are kept
             if self.crew is None or frames[0] not in self.crew.charge:
                 return None

@@ -60,6 +60,14 @@ def test_frames_of_one_press_are_shared_where_there_are_too_few_presses(shared_o
     assert len(crew.charge) == 7
 
 
+def test_no_frames_are_nobodys_work(monkeypatch):
+    """Also where one process keeps all cores busy, which then asks whether presses would be shared: there are none."""
+    model, hands = SimpleNamespace(presses=[0, 0], recipe=None, renderer=SimpleNamespace(at_once=True)), crews.Hands()
+    monkeypatch.setattr(crews, "_shares", lambda model: False)
+    hands.spent, hands.worked = 1.0, 1.0 + crews.cores()
+    assert list(hands.work(model, [], None)) == []
+
+
 def test_the_environment_says_how_many(monkeypatch):
     monkeypatch.setattr(crews, "_allowed", 1)
     monkeypatch.setattr(crews, "free_memory", lambda: 2.5 * crews.MEMORY)
