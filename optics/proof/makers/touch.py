@@ -29,11 +29,13 @@ FINE = 8  # parts of a pixel each way, on which blur acts: what a pixel has is t
 # Times the samples in the penumbra of a disc, and of light that is reflected twice: with 64 of them their own noise is
 # a tenth to a third of the photons', and most of it lies in the few pixels that show how large a disc is
 PENUMBRA, REFLECTED = 8, 4
+HALO = 0.04  # of the image's diagonal: the standard deviation of the halo, between the library's two
 AROUND = 6  # pixels beyond the borders that blur brings light from
 CAMERA = Noise(system_gain=0.04, dark_noise=0.8, black_level=8.0, saturation=255.0, prnu=0.0)
 MAKERS = (
     "lens vignetting",
     "veiling glare",
+    "lens halo",
     "lens blur",
     "colour crosstalk",
     "residual response curve",
@@ -411,6 +413,11 @@ class Maker:
             image = image * (np.cos(np.arctan(np.hypot(x, y))) ** (4 * e["lens vignetting"]))[..., None]
         if "veiling glare" in e:
             image = image + e["veiling glare"] * (image.mean((0, 1)) - image)
+        if "lens halo" in e:
+            from scipy.ndimage import gaussian_filter
+
+            width = HALO * np.hypot(*image.shape[:2])
+            image = image + e["lens halo"] * (gaussian_filter(image, (width, width, 0), mode="nearest") - image)
         signal = image @ self.matrix.T * v[f"{cam}.exposure"]
         if "gain drift" in e:
             signal = signal * (1 + e["gain drift"] * np.random.default_rng([self.seed, frame, 5]).standard_normal())

@@ -33,6 +33,7 @@ GRAIN = 0.4  # mm: of mottle and wrinkles
 IN_CAMERA = (
     "lens vignetting",
     "veiling glare",
+    "lens halo",
     "lens blur",
     "colour crosstalk",
     "residual response curve",
