@@ -4,7 +4,8 @@
 
     score         every effect against the calibrated model; the best are chosen        optics.diagnosis.score
     refit         each chosen effect is added and everything calibrated again            optics.diagnosis.refit
-    explanations  sets of effects compete: what survives, and what all survivors share   optics.diagnosis.explanations
+    search        sets of effects are refitted together                                  optics.diagnosis.search
+    competition   which of these explanations survive, and what all survivors share      optics.diagnosis.competition
     fingerprints  the residual as curves along every coordinate                          optics.diagnosis.fingerprints
     homogeneity   whether an effect's strength is the same in every part of the data     optics.diagnosis.homogeneity
     held out      frames that were not fitted                                            optics.diagnosis.held_out
@@ -22,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from optics.diagnosis import explanations, homogeneity, patterns, remarks
+from optics.diagnosis import competition, explanations, homogeneity, patterns, remarks, search, shared_noise
 from optics.diagnosis import fingerprints as prints
 from optics.diagnosis import held_out as held
 from optics.diagnosis import statistics as st
@@ -217,7 +218,7 @@ def _judge(request: Request, case: Case, chosen: list[Candidate], fits: dict[str
     """Competition, curves, laws and splits; effects that the competition had refitted are appended to `chosen`."""
     model, evidence, places = case.model, case.evidence, case.places or []
     basis = basis_of(model, evidence, evidence.structure(evidence.whitened, evidence.base))
-    outcome, levels = held.judge(case, explanations.search(case, chosen, fits))
+    outcome, levels = held.judge(case, search.search(case, chosen, fits))
     outcome = with_rivals(case, outcome)
     chosen += [c for c in case.table.order if c.effect.name in fits and c not in chosen]
     subject, best = subject_of(case, outcome), outcome.best
@@ -313,7 +314,7 @@ def _without_followers(
     if not any(t.members and not t.by_frame for t in outcome.survivors):
         return outcome, levels
     gone = [t for t in outcome.trials if t.by_frame]
-    return held.judge(case, explanations.beside_refuted(case, outcome, gone, f"its strengths follow {coordinate}"))
+    return held.judge(case, competition.beside_refuted(case, outcome, gone, f"its strengths follow {coordinate}"))
 
 
 def _best_first(case: Case, fits: Mapping[str, Fit]) -> list[Fit]:
@@ -378,8 +379,8 @@ def _split(case: Case, outcome: Outcome, subject: Candidate | None, basis: Basis
             left[trial.names],
             net,
             beside,
-            explanations.noise_of(case, outcome, trial),
-            explanations.fall_beside(outcome, trial, main.effect.name) - main.cone.expectation,
+            shared_noise.noise_of(case, outcome, trial),
+            competition.fall_beside(outcome, trial, main.effect.name) - main.cone.expectation,
             candidates=case.table.order,
         )
         splits += own

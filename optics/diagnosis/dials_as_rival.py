@@ -14,9 +14,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from optics.diagnosis.competition import design_effect
 from optics.diagnosis.dials import WIDTHS, unlikely, unstated
 from optics.diagnosis.evidence import Candidate
-from optics.diagnosis.explanations import Outcome, Trial, cost_of, design_effect, implausible
+from optics.diagnosis.explanations import Outcome, Trial, cost_of, implausible
 from optics.diagnosis.refit import FAILURES, Case, chi2, further
 from optics.diagnosis.thresholds import SURE
 from optics.fit.model import value_of

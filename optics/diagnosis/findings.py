@@ -12,13 +12,15 @@ import numpy as np
 from optics.diagnosis import dials_as_rival
 from optics.diagnosis import fingerprints as prints
 from optics.diagnosis import statistics as st
+from optics.diagnosis.competition import fall_over_noise, lead_without
 from optics.diagnosis.correlation import NOTICED, WANDER
 from optics.diagnosis.decide import Findings, Opponent, ordered, rivals
 from optics.diagnosis.dials import unstated
 from optics.diagnosis.evidence import Candidate, Evidence, at_bound
-from optics.diagnosis.explanations import Outcome, beside_noise, fall_over_noise, farness, lead_without
+from optics.diagnosis.explanations import Outcome, farness
 from optics.diagnosis.refit import Case, clear
 from optics.diagnosis.result import Basis, Fingerprint, Law, Level, Split
+from optics.diagnosis.shared_noise import beside_noise
 from optics.diagnosis.thresholds import AS_GOOD, DETAIL, HIDDEN, LEVEL, MAIN, MISSTATED, SURE, TOLD, UNEVEN
 from optics.fit.compare import led_label
 from optics.fit.model import Model, value_of

@@ -14,10 +14,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from optics.diagnosis import statistics as st
+from optics.diagnosis.competition import beside_refuted
 from optics.diagnosis.evidence import Candidate
-from optics.diagnosis.explanations import Outcome, Trial, beside_refuted, wander_of
+from optics.diagnosis.explanations import Outcome, Trial
 from optics.diagnosis.refit import Case, chi2, noisier
 from optics.diagnosis.result import Level, Shift
+from optics.diagnosis.shared_noise import wander_of
 from optics.diagnosis.thresholds import TOLD
 from optics.fit.branches import over_branches
 from optics.fit.calibrate import for_frames

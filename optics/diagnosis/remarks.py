@@ -12,10 +12,11 @@ from optics.captures import noise as camera_noise
 from optics.diagnosis import statistics as st
 from optics.diagnosis.decide import CURVE, HOMOGENEITY, PREDICTS, Findings
 from optics.diagnosis.evidence import Candidate, Evidence, at_bound, measure, priors
-from optics.diagnosis.explanations import Outcome, Trial, wander_of
+from optics.diagnosis.explanations import Outcome, Trial
 from optics.diagnosis.refit import Case
 from optics.diagnosis.result import NAMED, Basis, Condition, Shift, Split
 from optics.diagnosis.score import KAPPA, Table
+from optics.diagnosis.shared_noise import wander_of
 from optics.diagnosis.text import AT_FAULT, leaves_misfit, left_of, moved_by
 from optics.diagnosis.thresholds import CLEAR, EXCESS, LEVEL
 from optics.fit.model import value_of

@@ -22,16 +22,7 @@ from optics.diagnosis.result import (
     Shift,
     kinds_of,
 )
-from optics.diagnosis.thresholds import (
-    CLEAR,
-    CLUTTERED,
-    EXCESS,
-    LEVEL,
-    MARGIN,
-    MISSTATED,
-    STRENGTH,
-    SURE,
-)
+from optics.diagnosis.thresholds import CLEAR, CLUTTERED, EXCESS, LEVEL, MARGIN, MISSTATED, STRENGTH, SURE
 from optics.words import (
     ANYWHERE,
     NO_LIMIT,

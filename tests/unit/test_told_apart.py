@@ -7,7 +7,20 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from optics.diagnosis import diagnose, dials_as_rival, explanations, findings, held_out, laws, refit, remarks, score
+from optics.diagnosis import (
+    competition,
+    diagnose,
+    dials_as_rival,
+    explanations,
+    findings,
+    held_out,
+    laws,
+    refit,
+    remarks,
+    score,
+    search,
+    shared_noise,
+)
 from optics.diagnosis import statistics as st
 from optics.diagnosis.correlation import NOTICED, Correlation, Readings
 from optics.diagnosis.result import Law
@@ -42,13 +55,13 @@ def test_where_slopes_show_nothing_a_finite_step_decides():
 def test_what_is_known_of_dials_counts_whole_in_a_fall_and_once(monkeypatch, weight):
     """22 of chi2, 20 of them by which dials need not be off: noise that images share divides the other 2 alone. Where a
     fit that misses images had what is known count many times, it counts once all the same."""
-    monkeypatch.setattr(explanations, "design_effect", lambda *a: 10.0)
+    monkeypatch.setattr(competition, "design_effect", lambda *a: 10.0)
     best, without = (SimpleNamespace(fit=SimpleNamespace(values=v)) for v in (1.0, 21.0))
     outcome = SimpleNamespace(best=best, without=lambda *a: without, own_fall=lambda *a: 2.0 + 20.0 * weight)
     case = SimpleNamespace(
         lamp=None, evidence=SimpleNamespace(is_table=False), prior_chi2=lambda v: weight * v, known_chi2=lambda v: v
     )
-    assert explanations.fall_over_noise(case, outcome, "a") == pytest.approx(20.2)
+    assert competition.fall_over_noise(case, outcome, "a") == pytest.approx(20.2)
 
 
 @pytest.mark.parametrize("ahead, told", [(-5.0, True), (5.0, True), (15.0, False)])
@@ -57,7 +70,7 @@ def test_a_prediction_counts_against_a_lead_and_is_no_veto(ahead, told):
     best = SimpleNamespace(keys={1}, ahead=0.0)
     other = SimpleNamespace(keys={2}, ahead=-ahead, names=frozenset("b"), members=["b"])
     outcome = SimpleNamespace(leader=best, leads={other.names: (22.5, 10.8)})
-    assert explanations._told(None, outcome, best, other) is told
+    assert competition._told(None, outcome, best, other) is told
 
 
 @pytest.mark.parametrize(
@@ -67,15 +80,15 @@ def test_what_adds_no_more_than_chance_to_shared_noise_is_that_noise(gain, cost,
     """One strength: chance brings 6.6 once in a hundred times. A misalignment of 0 explains a lamp that wanders."""
     members = [SimpleNamespace(cone=SimpleNamespace(live=[0]))]
     trial = SimpleNamespace(deviance=100.0 - gain, cost=cost, members=members)
-    assert explanations._adds_to_noise(trial, SimpleNamespace(deviance=100.0)) is adds
+    assert competition._adds_to_noise(trial, SimpleNamespace(deviance=100.0)) is adds
 
 
 @pytest.mark.parametrize(
     "fit, cost, needed",
     [
-        (0.0, 13.7, explanations.NO_TIE),  # the same readings, by a less plausible pair: no claim
-        (0.0, 25.0, explanations.NO_TIE),  # 180 degrees against 1: a claim
-        (12.0, 1.0, explanations.SURE),  # the data tell
+        (0.0, 13.7, competition.NO_TIE),  # the same readings, by a less plausible pair: no claim
+        (0.0, 25.0, competition.NO_TIE),  # 180 degrees against 1: a claim
+        (12.0, 1.0, competition.SURE),  # the data tell
     ],
 )
 def test_plausibility_alone_must_lead_by_more(monkeypatch, fit, cost, needed):
@@ -85,9 +98,9 @@ def test_plausibility_alone_must_lead_by_more(monkeypatch, fit, cost, needed):
     best = SimpleNamespace(keys={("eccentric", None)}, deviance=100.0, cost=20.0, gain=0.0, members=["eccentric"])
     pair = SimpleNamespace(keys={("a", None)}, deviance=100.0 + fit, cost=20.0 + cost, gain=0.0, members=["a", "b"])
     lead = pair.deviance + pair.cost - best.deviance - best.cost
-    monkeypatch.setattr(explanations, "_lead", lambda *a: (lead, explanations.TOLD))
+    monkeypatch.setattr(competition, "_lead", lambda *a: (lead, competition.TOLD))
     outcome = SimpleNamespace(best=best, trials=[best, pair])
-    assert explanations._without(None, outcome, subject) == (pair, lead, needed)
+    assert competition._without(None, outcome, subject) == (pair, lead, needed)
 
 
 @pytest.mark.parametrize("strength, cost", [(0.84, 20.3), (0.02, 1.2)])
@@ -124,7 +137,7 @@ def test_a_set_names_what_is_likelier_than_its_simplest_member(deviance, lead, l
     )
     leads = {one.names: (0.0, 5.9), both.names: (lead, 5.9)}
     outcome = explanations.Outcome(other, one, [one, other], [other, both, one, base], 1.0, None, leads)
-    assert [c for t in explanations._larger(None, outcome) for c in t.members] == larger
+    assert [c for t in competition._larger(None, outcome) for c in t.members] == larger
 
 
 def test_all_sets_are_weighed_by_one_noise(monkeypatch):
@@ -144,23 +157,23 @@ def test_all_sets_are_weighed_by_one_noise(monkeypatch):
             readings=None,
         )
 
-    trials = [trial(n) for n in range(explanations.CONTENDERS + 20)]
+    trials = [trial(n) for n in range(competition.CONTENDERS + 20)]
     readings = {
         "correlation": lambda: SimpleNamespace(scale=1.0),
         "noise": lambda scale: SimpleNamespace(gain=20.0),
     }
-    monkeypatch.setattr(explanations, "_scale", lambda *_: 2.0)
-    monkeypatch.setattr(explanations, "_bound_wander", lambda *_: None)
+    monkeypatch.setattr(competition, "scale_of", lambda *_: 2.0)
+    monkeypatch.setattr(competition, "bound_wander", lambda *_: None)
 
     def readings_of(_, t):
         return SimpleNamespace(reached=t.after, standing=lambda scale: t.after / scale - 20.0, **readings)
 
-    monkeypatch.setattr(explanations, "_readings", readings_of)
-    monkeypatch.setattr(explanations, "wander_of", lambda *_: 0.0)
-    monkeypatch.setattr(explanations, "_lead", lambda *_: (0.0, 0.0))
-    monkeypatch.setattr(explanations, "_with_survivors", lambda _, outcome: outcome)
+    monkeypatch.setattr(competition, "readings_about", readings_of)
+    monkeypatch.setattr(competition, "wander_of", lambda *_: 0.0)
+    monkeypatch.setattr(competition, "_lead", lambda *_: (0.0, 0.0))
+    monkeypatch.setattr(competition, "_with_survivors", lambda _, outcome: outcome)
     case = SimpleNamespace(evidence=SimpleNamespace(is_table=True), session=SimpleNamespace(most=np.inf))
-    outcome = explanations.compete(case, trials)
+    outcome = competition.compete(case, trials)
     assert outcome.leader.after == 101.0
     assert {t.deviance - t.after for t in outcome.trials} == {0.0, -20.0}
 
@@ -196,8 +209,8 @@ def test_a_lamp_rules_out_nothing_that_leaves_less_where_misfit_is_left(monkeypa
     best, other = trial("a", 1e4, 9e3, 2.97e6, 47.0), trial("b", 1.1e4, 2e3, fall, cost)
     evidence = SimpleNamespace(is_table=False, normal=SimpleNamespace(count=20000), projected=SimpleNamespace(rank=20))
     case = SimpleNamespace(lamp=None, evidence=evidence, prior_chi2=lambda values: 0.0, known_chi2=lambda values: 0.0)
-    monkeypatch.setattr(explanations, "design_effect", lambda *a: 1.0)
-    lead, needed = explanations._lead(case, SimpleNamespace(scale=scale), best, other)
+    monkeypatch.setattr(competition, "design_effect", lambda *a: 1.0)
+    lead, needed = competition._lead(case, SimpleNamespace(scale=scale), best, other)
     assert (lead > needed) is ruled_out
 
 
@@ -212,9 +225,9 @@ def test_what_a_lamp_costs_is_judged_by_frames_and_not_by_pixels(monkeypatch):
     best, other = trial(1010.0, 10.0, 32.0), trial(1218.0, 200.0, 0.0)
     case = SimpleNamespace(lamp=None, evidence=SimpleNamespace(is_table=False))
     case.prior_chi2 = case.known_chi2 = lambda values: 0.0
-    monkeypatch.setattr(explanations, "design_effect", lambda *a: 18.0)
+    monkeypatch.setattr(competition, "design_effect", lambda *a: 18.0)
     other.gain = 2e5
-    lead, needed = explanations._lead(case, SimpleNamespace(scale=1.0), best, other)
+    lead, needed = competition._lead(case, SimpleNamespace(scale=1.0), best, other)
     assert lead == pytest.approx(190.0 + 18.0 / 18.0 - 32.0) and lead > needed
 
 
@@ -233,9 +246,9 @@ def test_what_leaves_an_unnoticed_lamp_is_a_rival_of_gains_of_each_frame(monkeyp
     best, other = trial("gains", 1000.0, 0.0, True), trial("detector", 1003.0, 997.0, False)
     evidence = SimpleNamespace(is_table=False)
     case = SimpleNamespace(lamp=None, evidence=evidence, prior_chi2=lambda values: 0.0, known_chi2=lambda values: 0.0)
-    monkeypatch.setattr(explanations, "design_effect", lambda *a: 1.0)
+    monkeypatch.setattr(competition, "design_effect", lambda *a: 1.0)
     outcome = SimpleNamespace(scale=1.0, base=SimpleNamespace(deviance=1003.0 + brings))
-    lead, needed = explanations._lead(case, outcome, best, other)
+    lead, needed = competition._lead(case, outcome, best, other)
     assert (lead > needed) is ruled_out
 
 
@@ -253,7 +266,7 @@ def test_names_of_one_law_are_not_chosen_by_what_their_strengths_are_counted_in(
     colours = SimpleNamespace(**{**vars(leak), "keys": frozenset({"leak", "tilt"})})  # contains the leak
     leads = {stray.names: (cost - 10.0, 10.8)}
     outcome = SimpleNamespace(trials=[leak, stray, colours], survivors=[leak], refuted=[], leads=leads, shared=False)
-    assert explanations._under_other_names(outcome) == ([stray] if found else [])
+    assert competition._under_other_names(outcome) == ([stray] if found else [])
 
 
 @pytest.mark.parametrize("brings, instead", [(2.0, True), (400.0, False)])
@@ -270,10 +283,10 @@ def test_gains_of_each_frame_lead_in_place_of_what_explains_nothing_beside_a_lam
     gains, curve = trial("gains", 1000.0, 0.0, True), trial("curve", 1110.0, 3e5, False)
     evidence = SimpleNamespace(is_table=False)
     case = SimpleNamespace(lamp=None, evidence=evidence, prior_chi2=lambda values: 0.0, known_chi2=lambda values: 0.0)
-    monkeypatch.setattr(explanations, "design_effect", lambda *a: 1.0)
+    monkeypatch.setattr(competition, "design_effect", lambda *a: 1.0)
     base = SimpleNamespace(deviance=1110.0 + brings, members=[], by_frame=False)
     outcome = SimpleNamespace(scale=1.0, base=base, leader=curve, trials=[base, curve, gains])
-    found = explanations._lamp_or_gains(case, outcome)
+    found = competition._lamp_or_gains(case, outcome)
     assert found is (gains if instead else None)
 
 
@@ -304,9 +317,9 @@ def test_misfit_that_is_left_beside_gains_of_each_frame_is_counted_without_a_lam
     other = trial(1180.0, 2070.0, 0.0, False, {"offset"})
     evidence = SimpleNamespace(is_table=False, normal=SimpleNamespace(count=1000), projected=SimpleNamespace(rank=20))
     case = SimpleNamespace(lamp=None, evidence=evidence, prior_chi2=lambda values: 0.0, known_chi2=lambda values: 0.0)
-    monkeypatch.setattr(explanations, "design_effect", lambda *a: 1.0)
-    monkeypatch.setattr(explanations, "_significant", lambda *a: 20.0)
-    lead, needed = explanations._lead(case, SimpleNamespace(scale=1.37), best, other)
+    monkeypatch.setattr(competition, "design_effect", lambda *a: 1.0)
+    monkeypatch.setattr(competition, "_significant", lambda *a: 20.0)
+    lead, needed = competition._lead(case, SimpleNamespace(scale=1.37), best, other)
     assert lead > needed
 
 
@@ -338,10 +351,10 @@ def test_a_dial_that_a_lamp_sent_far_off_counts_where_it_would_stand_beside_it(m
     dial = SimpleNamespace(prior=(0.0, 0.5))
     values = Values({"dial": 4.0})
     monkeypatch.setattr(Values, "put", lambda self, v, value: self.common.update(dial=value))
-    monkeypatch.setattr(explanations, "value_of", lambda model, values, v: values.common["dial"])
-    monkeypatch.setattr(explanations, "priors", lambda *a: None)
-    monkeypatch.setattr(explanations, "_kept", lambda *a: [np.zeros(1)])
-    monkeypatch.setattr(explanations, "_of_frames", lambda *a: SimpleNamespace(noise=lambda scale: None))
+    monkeypatch.setattr(competition, "value_of", lambda model, values, v: values.common["dial"])
+    monkeypatch.setattr(shared_noise, "priors", lambda *a: None)
+    monkeypatch.setattr(shared_noise, "kept_values", lambda *a: [np.zeros(1)])
+    monkeypatch.setattr(competition, "frames_about", lambda *a: SimpleNamespace(noise=lambda scale: None))
 
     def known(values):
         return (values.common["dial"] / 0.5) ** 2
@@ -352,7 +365,7 @@ def test_a_dial_that_a_lamp_sent_far_off_counts_where_it_would_stand_beside_it(m
     case = SimpleNamespace(**own, known_chi2=known, prior_chi2=lambda values: 10 * known(values))
     fit = SimpleNamespace(values=values)
     trial = SimpleNamespace(fit=fit, by_frame=False, gain=gain, settled={}, members=[], images=[])
-    assert explanations._from_priors(case, SimpleNamespace(scale=1.0), trial) == (10 * chi2, chi2)
+    assert competition._from_priors(case, SimpleNamespace(scale=1.0), trial) == (10 * chi2, chi2)
     assert values.common["dial"] == 4.0
 
 
@@ -381,12 +394,12 @@ def test_a_refit_from_the_end_of_another_must_explain_more_than_was_known(monkey
     film = SimpleNamespace(effect=SimpleNamespace(name="film"), row=SimpleNamespace(net=1.0))
     names, made = frozenset(["film"]), SimpleNamespace(fall=fall, fit="fit")
     trials = {} if known is None else {names: SimpleNamespace(fall=known)}
-    monkeypatch.setattr(explanations, "from_there", lambda case, members, start: "fit")
-    monkeypatch.setattr(explanations, "_trial", lambda case, members, found: made)
-    monkeypatch.setattr(explanations, "weighed", lambda case, found: None)
-    monkeypatch.setattr(explanations, "write", lambda *a: None)
+    monkeypatch.setattr(search, "from_there", lambda case, members, start: "fit")
+    monkeypatch.setattr(search, "trial_of", lambda case, members, found: made)
+    monkeypatch.setattr(search, "weighed", lambda case, found: None)
+    monkeypatch.setattr(search, "write", lambda *a: None)
     fits = {}
-    assert explanations._improved(None, trials, fits, [film], None) == better
+    assert search._improved(None, trials, fits, [film], None) == better
     assert (trials.get(names) is made) == better and fits == ({"film": "fit"} if better else {})
 
 
@@ -400,7 +413,7 @@ def test_a_lamp_may_swing_where_a_gain_of_each_frame_may_be_missing(scopes, comp
     case = SimpleNamespace(
         evidence=SimpleNamespace(is_table=False), table=SimpleNamespace(order=order), lamp=SimpleNamespace(most=0.0)
     )
-    explanations._bound_wander(case, [SimpleNamespace(members=["a"], complete=complete)])
+    shared_noise.bound_wander(case, [SimpleNamespace(members=["a"], complete=complete)])
     assert case.lamp.most == most
 
 
@@ -437,7 +450,7 @@ def test_gains_that_follow_a_setting_give_way_to_what_explains_them(monkeypatch,
         assert [t.names for t in gone] == ["gains", "gains, leak"] and "analyzer.angle" in why
         return SimpleNamespace(survivors=[t for t in outcome.survivors if t not in gone])
 
-    monkeypatch.setattr(explanations, "beside_refuted", beside)
+    monkeypatch.setattr(competition, "beside_refuted", beside)
     monkeypatch.setattr(held_out, "judge", lambda case, outcome: (outcome, ["levels"]))
     found, levels = diagnose._without_followers(None, outcome, [], "analyzer.angle")
     assert [t.names for t in found.survivors] == kept and levels == ["levels"] * bool(others)
@@ -575,7 +588,7 @@ def trial(members, fall, excess):
 def search_of_pairs(monkeypatch):
     """Refits pairs of effects that are ranked so, and reach so much; returns (names that were tried, those untried)."""
 
-    def search(trials, ranked, reached, lamp=0.0):
+    def pairs_of(trials, ranked, reached, lamp=0.0):
         case = SimpleNamespace(
             evidence=SimpleNamespace(
                 is_table=False, normal=SimpleNamespace(count=10000), projected=SimpleNamespace(rank=9)
@@ -590,16 +603,16 @@ def search_of_pairs(monkeypatch):
             tried.append(names := {c.effect.name for c in members})
             return trial(members, reached(names), 10.0)
 
-        monkeypatch.setattr(explanations.pairs, "ranked", lambda *_: ranked)
-        monkeypatch.setattr(explanations, "_gain", lambda case, t, scale: lamp if len(t.members) == 1 else 0.0)
-        monkeypatch.setattr(explanations, "_expected_gain", lambda *_: 0.0)
-        monkeypatch.setattr(explanations, "expected_cost", lambda c: 10.0)
-        monkeypatch.setattr(explanations, "with_effects", lambda *_: None)
-        monkeypatch.setattr(explanations, "_trial", made)
-        untried = explanations._joined(case, {t.names: t for t in trials})
+        monkeypatch.setattr(search.pairs, "ranked", lambda *_: ranked)
+        monkeypatch.setattr(search, "gain_of", lambda case, t, scale: lamp if len(t.members) == 1 else 0.0)
+        monkeypatch.setattr(search, "expected_gain", lambda *_: 0.0)
+        monkeypatch.setattr(search, "expected_cost", lambda c: 10.0)
+        monkeypatch.setattr(search, "with_effects", lambda *_: None)
+        monkeypatch.setattr(search, "trial_of", made)
+        untried = search._joined(case, {t.names: t for t in trials})
         return tried, [set(names) for names in untried]
 
-    return search
+    return pairs_of
 
 
 @pytest.mark.parametrize("lamp", [0.0, 9000.0])
@@ -618,7 +631,7 @@ def test_pairs_are_refitted_until_none_may_win_or_nobody_can_wait(search_of_pair
     trials = [trial([], 0.0, 70.0), *(trial([c], 5000.0, 35.0) for c in effects)]
     ranked = [(9900.0 - 20 * i, effects[0], c, np.zeros(2)) for i, c in enumerate(effects[1:])]
     ranked.append((7000.0, effects[1], effects[2], np.zeros(2)))
-    monkeypatch.setattr(explanations.pairs, "REFITTED", 3)
+    monkeypatch.setattr(search.pairs, "REFITTED", 3)
     # within CLEAR of what was reached, the second might still be better
     tried, untried = search_of_pairs(trials, ranked, lambda names: 9900.0)
     assert tried == [{"a", "b"}] and not untried
@@ -771,11 +784,11 @@ def test_a_refit_that_ended_where_the_base_is_survives_nothing(monkeypatch, chan
 
     base, best, other = trial("", 0.0, 0.0), trial("a", 840.0, 5.0), trial("b", change, math.sqrt(change) / 2)
     case = SimpleNamespace(evidence=SimpleNamespace(is_table=False), lamp=None)
-    monkeypatch.setattr(explanations, "_lead", lambda *a: (30.0, 18.0))
-    monkeypatch.setattr(explanations, "_told", lambda case, outcome, judge, t: t is base)
+    monkeypatch.setattr(competition, "_lead", lambda *a: (30.0, 18.0))
+    monkeypatch.setattr(competition, "_told", lambda case, outcome, judge, t: t is base)
     monkeypatch.setattr(explanations.Outcome, "core", [])
     outcome = explanations.Outcome(best, best, [best], [best, other, base], 1.0, None)
-    assert explanations._survived(case, outcome).survivors == ([best, other] if survives else [best])
+    assert competition._survived(case, outcome).survivors == ([best, other] if survives else [best])
 
 
 @pytest.mark.parametrize(
