@@ -52,7 +52,7 @@ def check_even_light_stays():
     """An even image and an even slope stay as they are, up to the borders."""
     v, u = np.mgrid[:24, :32]
     image = (5.0 + 0.02 * u - 0.03 * v)[..., None]
-    agree(scatter(image, SimpleNamespace(halo_near=0.1, halo_far=0.1)), image, 1e-9)
+    agree(scatter(image, SimpleNamespace(halo_near=0.1, halo_far=0.1)), image, 1e-7)  # the kernels end at six sd
 
 
 effect = Effect(
