@@ -117,14 +117,14 @@ def test_the_example_effect_is_an_effect(tmp_path):
 
     from optics.scene import registry
 
-    text = re.search(r"```python\n(\"\"\"Halo.*?)```", page("write-an-effect"), re.DOTALL)[1]
-    file = tmp_path / "halo.py"
+    text = re.search(r"```python\n(\"\"\"Lens ghost.*?)```", page("write-an-effect"), re.DOTALL)[1]
+    file = tmp_path / "lens_ghost.py"
     file.write_text(text, encoding="utf-8")
     (found,) = registry.declared(file)
-    assert found.key == "halo" and found.parameter_names == ("halo",)
+    assert found.key == "lens-ghost" and found.parameter_names == ("ghost",)
     image = np.random.default_rng(0).random((20, 30, 3))
     (parameter,) = found.parameters
-    at_rest = type("Camera", (), {"halo": parameter.neutral})
+    at_rest = type("Camera", (), {"ghost": parameter.neutral})
     assert np.array_equal(found.stages["lens"](image, at_rest), image)
 
 
