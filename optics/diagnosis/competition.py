@@ -143,7 +143,7 @@ def _larger(case: Case, outcome: Outcome) -> list[Trial]:
             continue
         if outcome.shared and not _adds_to_noise(t, outcome.base):
             continue
-        if t is outcome.leader or not _told(case, outcome, outcome.leader, t):
+        if t is outcome.leader or not _ruled_out(case, outcome, outcome.leader, t):
             found.append(t)
     return found
 
@@ -180,8 +180,8 @@ def _survived(case: Case, outcome: Outcome) -> Outcome:
     while True:
         # what the leader rules out stays so beside a simpler one
         judges = [best] if best is outcome.leader else [best, outcome.leader]
-        told = {id(t) for t in outcome.trials for j in judges if t is not j and _told(case, outcome, j, t)}
-        alive = [best] + [t for t in outcome.trials if t is not best and id(t) not in told]
+        ruled_out = {id(t) for t in outcome.trials for j in judges if t is not j and _ruled_out(case, outcome, j, t)}
+        alive = [best] + [t for t in outcome.trials if t is not best and id(t) not in ruled_out]
         alive += [t for t in _inherited(case, outcome, alive) if t not in alive]
         alive = [t for t in alive if t is best or not _says_nothing(t, base)]
         outcome.shared |= able and base in alive
@@ -238,7 +238,7 @@ def _all_without(case: Case, outcome: Outcome, name: str) -> list[Trial]:
     return sorted(found, key=lambda t: t.deviance + t.cost)
 
 
-def _told(case: Case, outcome: Outcome, best: Trial, other: Trial) -> bool:
+def _ruled_out(case: Case, outcome: Outcome, best: Trial, other: Trial) -> bool:
     """Whether an explanation is ruled out beside the best; one that says the same with more is not asked."""
     if best.keys < other.keys:
         return True

@@ -251,21 +251,21 @@ def _written(
     outcome, subject, findings, basis = judged.outcome, judged.subject, judged.findings, judged.basis
     best = outcome.best
     word, conditions = decide(findings)
-    told = outcome.told()
+    records = outcome.records()
 
     remarks.write_limits(case, best if word == "CLAIM" else None, basis)
     remarks.write_verdicts(table, word, subject, outcome, judged.splits)
     rows, names = [c.row for c in table.order], [c.effect.name for c in chosen]
     gaps, correct = _gaps(case, outcome, chosen)
-    ambiguous = list(dict.fromkeys(name for e in told if e.possible for name in e.effects))
-    kinds = [[e.name for e in kind] for kind in kinds_of(told)]
+    ambiguous = list(dict.fromkeys(name for e in records if e.possible for name in e.effects))
+    kinds = [[e.name for e in kind] for kind in kinds_of(records)]
     if findings.fragile and findings.fragile not in ambiguous:  # by other weights or masks it is the best
         ambiguous.append(findings.fragile)
         kinds.append([findings.fragile])
     hints = remarks.hints_of(word, conditions, outcome, findings, gaps, names)
     if subject and word in NAMED:
         hints = [*remarks.replaced(case, best, request.added), *hints]
-    text = sentence(word, conditions, findings, rows, told, judged.fingerprints, judged.levels, judged.shifts, basis)
+    text = sentence(word, conditions, findings, rows, records, judged.fingerprints, judged.levels, judged.shifts, basis)
     text = " ".join(filter(None, [text, remarks.lamp_text(case, outcome, basis)]))
     if word in ("UNKNOWN", "CANNOT_TELL"):
         text, first = _unexplained(case, word, text, judged.fingerprints, judged.families, findings, basis)
@@ -298,7 +298,7 @@ def _written(
         ],
         kinds=kinds if word == "AMBIGUOUS" else [],
         claimed=subject.effect.name if subject and word == "CLAIM" else "",
-        explanations=told,
+        explanations=records,
         families=judged.families,
         laws=judged.laws,
         fits=fits,
@@ -351,7 +351,7 @@ def _split(case: Case, outcome: Outcome, subject: Candidate | None, basis: Basis
     splits: list[Split] = []
     chance = math.nan
     done: set[str] = set()
-    left = {frozenset(e.effects): e for e in outcome.told()}
+    left = {frozenset(e.effects): e for e in outcome.records()}
     for trial in outcome.survivors:
         if not trial.members or len(done) >= MAX_SPLIT:
             continue

@@ -159,7 +159,7 @@ class Outcome:
         """What an effect adds to the fall of the others of its trial."""
         return trial.fall - self.without(trial, name).fall
 
-    def told(self) -> list[Explanation]:
+    def records(self) -> list[Explanation]:
         """All trials as records, the best first and those that were refuted last."""
         found: list[Explanation] = []
         same = self._same_as()

@@ -361,18 +361,18 @@ def goes_with(found: Sequence[Family]) -> str:
 
     weighed = math.isfinite(found[0].share)
 
-    def told(f: Family) -> str:
+    def words(f: Family) -> str:
         name = "a setting" if f.family == "setting" else f"the {f.family}" if f.family == "camera" else f.family
         how = f" {max(f.share, 0.0):.0%}" if weighed else "" if f is found[0] else f", {max(f.of_best, 0.0):.2f} of it"
         return f"{name} ({f.coordinate}{how})"
 
     near = [f for f in found[1:] if f.of_best > AS_GOOD and f.coordinate not in MIMICS]
     rest = [f for f in found[1:] if f not in near]
-    text = f"It goes with {' or '.join(map(told, [found[0], *near]))}"
+    text = f"It goes with {' or '.join(map(words, [found[0], *near]))}"
     text += ", which these captures do not separate" if near else ""
     if rest:
         text += (
-            f"; less with {', '.join(map(told, rest))}" if near else f" rather than with {', '.join(map(told, rest))}"
+            f"; less with {', '.join(map(words, rest))}" if near else f" rather than with {', '.join(map(words, rest))}"
         )
     how = (
         "of the excess misfit a curve along it explains"

@@ -112,12 +112,12 @@ def split(
         return max(HAIR, min(EVEN if s.chance < LEVEL else UNEVEN, SAME_PLACE * excess / max(net, 1e-9)))
 
     results = [replace(s, limit=most(s), holds=s.h <= most(s)) for s in results]
-    told = added if table else whole
+    judged = added if table else whole
     if c.effect.scope == "frame":  # frames do not scatter about strengths that each has for itself
         places = [{name: values for name, values in p.items() if name != "frame"} for p in places]
-    others = told.others if added is told else ()
-    chance, clutter, errors = scatter(told.own, told.calibrated, told.effect, told.change, places, net, others)
-    if added is not told:  # errors are those of a fit without a lamp; whether it is there is asked beside that lamp
+    others = judged.others if added is judged else ()
+    chance, clutter, errors = scatter(judged.own, judged.calibrated, judged.effect, judged.change, places, net, others)
+    if added is not judged:  # errors are those of a fit without a lamp; whether it is there is asked beside that lamp
         change = _at_optimum(added)
         chance, *_ = scatter(added.own, added.calibrated, added.effect, change, places, over_noise, added.others)
     return results, chance, clutter, errors

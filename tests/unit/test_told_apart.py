@@ -70,7 +70,7 @@ def test_a_prediction_counts_against_a_lead_and_is_no_veto(ahead, told):
     best = SimpleNamespace(keys={1}, ahead=0.0)
     other = SimpleNamespace(keys={2}, ahead=-ahead, names=frozenset("b"), members=["b"])
     outcome = SimpleNamespace(leader=best, leads={other.names: (22.5, 10.8)})
-    assert competition._told(None, outcome, best, other) is told
+    assert competition._ruled_out(None, outcome, best, other) is told
 
 
 @pytest.mark.parametrize(
@@ -785,7 +785,7 @@ def test_a_refit_that_ended_where_the_base_is_survives_nothing(monkeypatch, chan
     base, best, other = trial("", 0.0, 0.0), trial("a", 840.0, 5.0), trial("b", change, math.sqrt(change) / 2)
     case = SimpleNamespace(evidence=SimpleNamespace(is_table=False), lamp=None)
     monkeypatch.setattr(competition, "_lead", lambda *a: (30.0, 18.0))
-    monkeypatch.setattr(competition, "_told", lambda case, outcome, judge, t: t is base)
+    monkeypatch.setattr(competition, "_ruled_out", lambda case, outcome, judge, t: t is base)
     monkeypatch.setattr(explanations.Outcome, "core", [])
     outcome = explanations.Outcome(best, best, [best], [best, other, base], 1.0, None)
     assert competition._survived(case, outcome).survivors == ([best, other] if survives else [best])
