@@ -17,7 +17,17 @@ from typing import Any
 import numpy as np
 
 from optics.captures import readings
-from optics.captures.noise import DEMOSAICED, PER_CHANNEL, SATURATED, UNITS, UNLIMITED, Noise, repeated, step_of
+from optics.captures.noise import (
+    DEMOSAICED,
+    PER_CHANNEL,
+    SATURATED,
+    UNITS,
+    UNLIMITED,
+    Noise,
+    may_be_demosaiced,
+    repeated,
+    step_of,
+)
 from optics.captures.readings import DECIMALS, DELIMITERS, NAMES, Row, Table
 from optics.errors import BadCapture, BadScene, OutputExists, UnknownKey
 from optics.files import toml_checks as checks
@@ -68,6 +78,7 @@ UNMOVED = 8  # readings in a row at one setting, on average, from which its erro
 SUNK = 5.0  # sd of the dark noise that the median of a frame may lie below the black level
 Find = Callable[[str, str], Path]  # (name, where it stands) -> the file, or BadCapture
 CFA = ("RGGB", "BGGR", "GRBG", "GBRG")
+NO_CFA = "none"  # each pixel has measured values of its own in all channels
 
 
 @dataclass
@@ -130,6 +141,7 @@ class Captures:
     exclude: dict[str, str] = field(default_factory=dict)
     step: float = 0.0
     mosaic: Mosaic | None = None  # of analysers (deg), row by row: image is (H, W, 1), each pixel seen through its own
+    unfiltered: bool = False  # stated: no mosaic of colour filters, each pixel measures all channels
     files: dict[str, Path] = field(default_factory=dict)  # all that was read, by the name that captures.toml has for it
 
     def uncertainty_of(self, frame: Frame) -> dict[str, Any]:
@@ -161,7 +173,8 @@ def load(path: str | Path, outside: bool = False) -> Captures:
     if scene.lower().endswith(".xml"):
         scene = str(checks.existing(folder, scene, f"{where}: scene").resolve())
     values_are = checks.text(data, "values_are", where, ("DN", "radiance")) or "DN"
-    cfa = checks.text(data, "cfa", where, CFA)
+    cfa = checks.text(data, "cfa", where, (*CFA, NO_CFA))
+    unfiltered, cfa = cfa == NO_CFA, None if cfa == NO_CFA else cfa
     noise = _noise(data["noise"], f"{where}: [noise]", "table" in data) if "noise" in data else None
     common = checks.settings(data.get("parameters", {}), f"{where}: [parameters]")
     if ("frames" in data) == ("table" in data):
@@ -170,7 +183,7 @@ def load(path: str | Path, outside: bool = False) -> Captures:
             "one [[frames]] or more, or one [table] of point readings"
         )
     mosaic = _mosaic(data["mosaic"], cfa, where) if "mosaic" in data else None
-    captures = Captures(folder, scene, [], common, noise, None, cfa, values_are, mosaic=mosaic)
+    captures = Captures(folder, scene, [], common, noise, None, cfa, values_are, mosaic=mosaic, unfiltered=unfiltered)
     captures.bands = _bands(data, where)
     captures.absent = checks.texts(data, "absent", where)
     captures.uncertainty = _uncertainty(data.get("uncertainty", {}), f"{where}: [uncertainty]")
@@ -190,7 +203,7 @@ def load(path: str | Path, outside: bool = False) -> Captures:
         captures.table, captures.frames, step = _read_table(find, data["table"], f"{where}: [table]")
     else:
         _read_frames(captures, find, data["frames"], where)
-        if values_are == "DN" and cfa is None and captures.frames[0].image.shape[2] == 3:
+        if may_be_demosaiced(captures):
             captures.warnings.append(DEMOSAICED)
         if "flat_field" in data:
             here = f"{where}: flat_field"
@@ -853,8 +866,8 @@ def _fill(captures: Captures, folder: Path, final: Path, bits: int | None) -> No
         document["absent"] = captures.absent
     if captures.flat_field is not None:
         document["flat_field"] = _write_flat(folder / "flat_field", captures.flat_field, bits).name
-    if captures.cfa:
-        document["cfa"] = captures.cfa
+    if captures.cfa or captures.unfiltered:
+        document["cfa"] = captures.cfa or NO_CFA
     if captures.mosaic:
         document["mosaic"] = [list(row) for row in captures.mosaic]
     if captures.noise:

@@ -45,7 +45,8 @@ UNITS = {
 }
 DEMOSAICED = (
     "3 channels and no cfa: if these are demosaiced, neighbouring pixels share their noise and a diagnosis raises "
-    "false alarms (85 % of sets at a perfect chi2); supply raw frames and cfa"
+    "false alarms (85 % of sets at a perfect chi2); supply raw frames and cfa. If each pixel measured all three, state "
+    'cfa = "none"'
 )
 UNLIMITED = (
     "the end of the instrument's range is not known, so that no reading is left out as saturated; give saturation "
@@ -425,6 +426,12 @@ def _brightest(frame: Frame) -> float:
     return float(np.max(own, initial=-math.inf, where=np.isfinite(own)))
 
 
+def may_be_demosaiced(captures: Captures) -> bool:
+    """Whether three channels of its images may come from one value per pixel, for all that is stated."""
+    plain = captures.values_are == "DN" and captures.table is None and captures.cfa is None and not captures.unfiltered
+    return plain and captures.frames[0].image.shape[2] == 3
+
+
 def warnings_of(noise: Noise, captures: Captures) -> list[str]:
     """What about the camera and the frames weakens a verdict, in sentences."""
     found = [
@@ -434,13 +441,7 @@ def warnings_of(noise: Noise, captures: Captures) -> list[str]:
             "at 0 and "
             "masked, and half a DN of black level looks like glare: raise the camera's offset",
         ),
-        (
-            captures.values_are == "DN"
-            and captures.cfa is None
-            and captures.table is None
-            and captures.frames[0].image.shape[2] == 3,
-            DEMOSAICED,
-        ),
+        (may_be_demosaiced(captures), DEMOSAICED),
         (
             captures.values_are == "DN"
             and noise.ends

@@ -230,6 +230,10 @@ def test_a_flat_field_per_frame(folder):
 def test_what_costs_trust_is_a_warning(folder):
     text = 'scene = "bench"\n[[frames]]\nimage = "frames/rgb.png"\n'
     assert any("demosaiced" in w and "cfa" in w for w in load(folder, text + NOISE).warnings)
+    measured = load(folder, 'cfa = "none"\n' + text + NOISE)  # as of three sensors
+    assert measured.cfa is None and not any("demosaiced" in w for w in measured.warnings)
+    again = captures.load(captures.write(measured, folder / "copy", bits=8))
+    assert again.cfa is None and not any("demosaiced" in w for w in again.warnings)
     assert any("repeated frames" in w for w in load(folder, text).warnings)
     assert load(folder, 'scene = "bench"\n' + FRAME + NOISE).warnings == []
 
