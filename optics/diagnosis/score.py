@@ -25,6 +25,7 @@ from optics.scene.parameter import Variable
 from optics.words import some
 
 REALISED = 0.5  # of the fall that a score promises: what its refit must have brought to count against another
+RIVAL = 0.5  # of an effect's score: what another must have as well, for other weights to overturn the order of both
 SETTLED = 0.01  # of the excess of chi2 per parameter: what a calibrated base may still absorb. Derivative images of
 # moving edges are finite samples, which no calibration makes orthogonal to a residual with structure
 MOVING = 0.15  # of the excess in all: what a tempered base may still absorb
@@ -210,7 +211,9 @@ class Table:
         }
 
     def fragile(self, effect: str, beside: Collection[str] = ()) -> str:
-        """An effect that other weights or masks prefer clearly, while the score itself does not; '' for none.
+        """An effect that other weights or masks prefer clearly, and that is a RIVAL by the score itself, which does not
+        prefer it clearly; '' for none. Equal weights count bright frames alone where a cause shows in dark ones: what
+        explains a thirtieth of the misfit is no rival, whatever else it explains of bright frames.
 
         beside   effects that are missing as well
         """
@@ -223,6 +226,8 @@ class Table:
                 tried = own[name].row.refit
                 if tried is not None and tried.fall < REALISED * own[name].row.fall:
                     continue  # a finite step that promises what no refit brings
+                if own[name].row.net < RIVAL * own[effect].row.net:
+                    continue
                 if net[name] - net[effect] > CLEAR and own[name].row.net - own[effect].row.net < CLEAR:
                     return name
                 break

@@ -527,6 +527,23 @@ def test_what_survives_overturns_nothing():
     assert table.fragile("a") == ""
 
 
+@pytest.mark.parametrize(("net", "other"), [(48.0, ""), (900.0, "vignetting")])
+def test_what_explains_a_thirtieth_overturns_nothing(net, other):
+    """A turned analyser shows in dark, crossed frames. Equal weights ask bright frames, in which vignetting explains
+    48 of chi2: that is no rival of the analyser's 1542."""
+
+    def candidate(name, own):
+        return SimpleNamespace(
+            effect=SimpleNamespace(name=name),
+            row=SimpleNamespace(net=own, fall=own, refit=None),
+            contains=lambda other: False,
+        )
+
+    order = [candidate("misalignment", 1542.0), candidate("vignetting", net)]
+    uniform = {"misalignment": 11.0, "vignetting": 60.0}
+    assert Table(order, np.zeros((0, 0)), None, 0.0, uniform, {}).fragile("misalignment") == other
+
+
 def test_more_of_what_is_missing_overturns_nothing():
     """Other weights prefer a coloured leak to stray light, by itself: it contains the leak that is missing beside stray
     light."""
