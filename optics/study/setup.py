@@ -417,9 +417,16 @@ def effect_variables(model: SceneModel, effect: Effect, held: Sequence[Variable]
 
 
 def _untouched(model: SceneModel, frames: Sequence[int]) -> bool:
-    """Whether frames say that nothing presses the skin, so that there is no place of a press to solve for."""
+    """Whether nothing presses the skin in these frames, so that there is no place of a press to solve for: they say so,
+    or neither they nor the scene say anything of a press."""
     keys = keys_with(model.parameters, "press depth")
-    return bool(keys) and all(model.frames[i].parameters.get(key) == 0 for key in keys for i in frames)
+    of_presses = [key for key, p in model.parameters.items() if p.free == "press"]
+
+    def depth(frame: int, key: str) -> Any:
+        stated = model.frames[frame].parameters
+        return stated.get(key, math.nan if any(k in stated for k in of_presses) else model.base[key])
+
+    return bool(keys) and all(depth(i, key) == 0 for key in keys for i in frames)
 
 
 def _with_prior(model: SceneModel, variable: Variable, pattern: str, prior: tuple[float | None, float]) -> Variable:

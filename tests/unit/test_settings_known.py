@@ -613,3 +613,23 @@ def test_a_curve_beside_readings_takes_their_bands_and_what_is_absent(mitsuba, t
     assert found["channels"] == ["reading"] and np.ptp(readings) < 1e-9 * readings.max()  # no analyser, no Malus
     assert main([*line, "-D", "bands=470, 530, 625"]) == 2
     assert "readings of 1 channels" in capsys.readouterr().err
+
+
+def test_where_nothing_speaks_of_a_press_none_is_sought(mitsuba):
+    """Groups of frames of a skin that nothing presses: by the frames, or by the scene where these are silent. A press
+    whose place is stated and whose depth is not has a depth to be found."""
+    from optics.fit.scene_model import SceneModel
+    from optics.scene import loader
+    from optics.study.setup import Setup, variables_of_base
+
+    stated = {
+        "silent": {},
+        "flat": {"gel.press_depth": 0.0},
+        "place": {"gel.press_x": 1.0},
+        "deep": {"gel.press_depth": 0.4},
+    }
+    frames = [Frame(n, np.zeros((18, 24, 3), np.float32), parameters=p, group=n) for n, p in stated.items()]
+    scene = loader.load("gelsight", {"width": 24, "height": 18})
+    model = SceneModel(scene, Captures(Path("."), str(scene.path), frames, noise=Noise(0.1, 1.0, 2.0, 255.0, 0.0)))
+    sought = {v.name for v in variables_of_base(model, Setup("."), range(4)) if v.keys == ("gel.press_depth",)}
+    assert sought == {"gel.press_depth[place]", "gel.press_depth[deep]"}
