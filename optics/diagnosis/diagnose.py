@@ -266,10 +266,12 @@ def _written(
     if subject and word in NAMED:
         hints = [*remarks.replaced(case, best, request.added), *hints]
     text = sentence(word, conditions, findings, rows, records, judged.fingerprints, judged.levels, judged.shifts, basis)
-    text = " ".join(filter(None, [text, remarks.lamp_text(case, outcome, basis)]))
+    lamp = remarks.lamp_text(case, outcome, basis)
     if word in ("UNKNOWN", "CANNOT_TELL"):
-        text, first = _unexplained(case, word, text, judged.fingerprints, judged.families, findings, basis)
+        text, first = _unexplained(case, word, text, lamp, judged.fingerprints, judged.families, findings, basis)
         hints = [*first, *hints]
+    else:
+        text = " ".join(filter(None, [text, lamp]))
     # of one press, what is fixed in the image and what is the surface's own look the same
     if leaves_misfit(best.excess_sd, basis) and not (
         FIXED_HINT in hints and len(patterns.presses_of(model, evidence)) < 2
@@ -428,23 +430,32 @@ def _unexplained(
     case: Case,
     word: str,
     text: str,
+    lamp: str,
     fingerprints: Sequence[Fingerprint],
     families: Sequence[Family],
     findings: Findings,
     basis: Basis,
 ) -> tuple[str, list[str]]:
-    """(sentence, what to do about patterns of the image) where no effect explains the residual."""
+    """(sentence, what to do about patterns of the image) where no effect explains the residual.
+
+    lamp   what a lamp did to whole frames, in words: not said where one light of several is found to have done it"""
     excess, best = _excess(basis), max([f.share for f in fingerprints], default=0.0)
     pattern = partial(patterns.fixed_pattern, case.model, case.evidence, excess)
     fixed = patterns.fixed_text(pattern(), best, pattern(True), pattern(True, True))
     drift = patterns.drifting_pattern(case.model, case.fit.values, case.evidence, excess, case.seed)
     drifting = patterns.drifting_text(drift)
-    found = [part[0].upper() + part[1:] for part in (fixed, drifting) if part]
-    parts = [*found, text[0].upper() + text[1:] if found else text]
+    light, share, swing = patterns.swinging_light(case.model, case.evidence, excess)
+    texts = (fixed, drifting, patterns.swinging_text(light, share, swing))
+    found = [part[0].upper() + part[1:] for part in texts if part]
+    parts = [*found, text[0].upper() + text[1:] if found else text, "" if light else lamp]
     if word == "UNKNOWN" or findings.fall < SHARE * excess:
         parts.append(prints.unexplained(fingerprints, findings.fall, excess))
     if word == "UNKNOWN" and not fixed and not (drifting and drift.share > best):
         parts.append(prints.goes_with(families))
-    return " ".join(filter(None, parts)), [DRIFT_HINT] * bool(drifting) + [FIXED_HINT] * (
-        "same in every frame" in fixed
-    )
+    hints = [DRIFT_HINT] * bool(drifting) + [FIXED_HINT] * ("same in every frame" in fixed)
+    if light:
+        hints.append(
+            f'state how steady it is ([uncertainty] "{light}.power" = {swing:.1g} in captures.toml, of the power that '
+            "frames set), calibrate again, and diagnose what is left"
+        )
+    return " ".join(filter(None, parts)), hints

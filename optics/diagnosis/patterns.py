@@ -21,8 +21,9 @@ from optics.diagnosis.evidence import Evidence
 from optics.diagnosis.result import Drift, Surface
 from optics.diagnosis.thresholds import EXCESS, LEVEL, SHARE
 from optics.fit.compare import led_label
-from optics.fit.model import Model
+from optics.fit.model import Model, value_of
 from optics.scene.parameter import Values
+from optics.words import percent
 
 NEARLY_ALL = 0.8  # share of the excess: what is fixed in the image is fixed, whatever curve comes near it
 MORE = 0.1  # share of the excess, by which further gains must explain more to be the pattern's own
@@ -30,6 +31,7 @@ REPEATED = 3  # frames that show a pixel, for a pattern to be called fixed
 SEVERAL = 6  # frames, from which their order can be told from chance: 720 orders
 MANY = 12  # contacts, over which a law is told from what is each contact's own
 LIGHTS = 3  # of a press, under which a pixel is seen
+HALF = 0.5  # of the excess, from which the light that changes is named
 CELLS = 6  # each way, in which a contact is divided
 MUCH = 0.25  # of what is left, from which it is said
 DISTANT = 1 / 3  # of the session: frames that are so far apart share what does not change
@@ -78,6 +80,53 @@ def fixed_pattern(
     by_gains, gains = float(np.sum(along[use] ** 2 / length[use])), int(use.sum())
     left = (float(square[use].sum()) - by_gains) / max(float(count[use].sum()) - gains, 1.0)
     return (by_gains - gains * max(left, 1.0)) * evidence.thinning / excess
+
+
+def swinging_light(model: Model, evidence: Evidence, excess: float) -> tuple[str, float, float]:
+    """(light, share of the excess misfit that its power explains when it is free in each frame, rms of the relative
+    change) of the light of which that explains most, and another light less than half as much; ('', NaN, NaN) for none.
+
+    By the images of powers that are calibrated, less what noise explains, as in `fixed_pattern`; REPEATED lit frames
+    or more.
+    excess   chi2 less its degrees of freedom
+    """
+    lights: dict[str, list[int]] = {}
+    for i in evidence.base:
+        v = evidence.columns[i]
+        if v.parameter.role in ("power", "band power") and v.frames is None and len(v.keys) == 1:
+            lights.setdefault(v.keys[0].rpartition(".")[0], []).append(i)
+    if len(lights) < 2 or isinstance(evidence.spectrum, st.Sweeps) or not excess > 0:
+        return "", math.nan, math.nan
+    found = []
+    for light, columns in lights.items():
+        powers = np.array([value_of(model, evidence.values, evidence.columns[i]) for i in columns])
+        change, along, left, count = [], 0.0, 0.0, 0
+        for block in evidence.blocks:
+            image = block.columns(columns) @ powers
+            length = float(image @ image)
+            if length > 0:
+                change.append(float(image @ block.r) / length)
+                along += change[-1] ** 2 * length
+                left, count = left + float(block.r @ block.r) - change[-1] ** 2 * length, count + len(block.r)
+        if len(change) >= REPEATED:
+            chance = len(change) * max(left / max(count - len(change), 1), 1.0)
+            swing = math.sqrt(float(np.mean(np.square(change))))
+            found.append(((along - chance) * evidence.thinning / excess, light, swing))
+    found.sort(reverse=True)
+    if len(found) < 2 or found[0][0] < HALF or found[1][0] > found[0][0] / 2:
+        return "", math.nan, math.nan
+    share, light, swing = found[0]
+    return light, share, swing
+
+
+def swinging_text(light: str, share: float, swing: float) -> str:
+    """One sentence on that light; '' for none."""
+    if not light:
+        return ""
+    return (
+        f"the power of {light} alone, free in each frame, explains {min(share, 1.0):.0%} of the excess: this light "
+        f"changed from frame to frame by {percent(swing, 2)} (rms)."
+    )
 
 
 def fixed_text(share: float, best: float, by_channel: float = math.nan, by_light: float = math.nan) -> str:

@@ -23,11 +23,19 @@ from optics.diagnosis.fingerprints import (
     places,
     unexplained,
 )
-from optics.diagnosis.patterns import drifting_pattern, drifting_text, fixed_pattern, fixed_text
+from optics.diagnosis.patterns import (
+    drifting_pattern,
+    drifting_text,
+    fixed_pattern,
+    fixed_text,
+    swinging_light,
+    swinging_text,
+)
 from optics.diagnosis.result import Basis, Family, Fingerprint
 from optics.diagnosis.statistics import Sweeps
 from optics.errors import OutputExists, UnknownKey
 from optics.fit.geometry import lit_geometry
+from optics.fit.model import value_of
 from optics.lookup import lookup
 from optics.scene.registry import declared, known
 from optics.study import draft
@@ -225,6 +233,34 @@ def test_a_pattern_that_successive_frames_share_is_a_sensor_that_changes():
 def test_what_frames_share_in_any_order_and_a_lamp_are_no_sensor_that_changes(pattern):
     model, fit, evidence, excess = of_a_session(pattern)
     assert not drifting_text(drifting_pattern(model, fit.values, evidence, excess))
+
+
+@pytest.mark.parametrize(("changed", "named"), [((1,), "led1"), ((), ""), ((0, 1, 2), "")])
+def test_one_light_that_changes_from_frame_to_frame_is_named(changed, named):
+    """The power of one light wanders by 3 % (rms) in twelve frames; in noise, and where an exposure makes all lights
+    wander alike, no light is named."""
+    frames = list(range(12))
+    model, rng = MockModel(len(frames), 16), np.random.default_rng(6)
+    start = simulate(model, rng)
+    swing = 0.03 * rng.standard_normal(len(frames))
+    for n, frame in enumerate(model.frames[: len(frames)]):
+        (before,) = model.predict(start, [n])
+        moved = start.copy()
+        for light in changed:
+            v = model.variable(f"led{light}.power")
+            moved.put(v, value_of(model, start, v) * (1 + swing[n]))
+        (after,) = model.predict(moved, [n])
+        frame.image = frame.image + (after - before).astype(np.float32)
+    fit = mock_fit(model, model.base_variables(frames), start, frames)
+    evidence = measure(model, fit.values, fit.variables, [], frames, 400_000, 0, lambda *a: None)
+    excess = evidence.projected.chi2 - (evidence.normal.count - evidence.projected.rank)
+    light, share, rms = swinging_light(model, evidence, excess)
+    assert light == named
+    if named:
+        # presses of their own take up some of it; of twelve draws the rms scatters by a fifth
+        assert share > 0.8 and rms == pytest.approx(np.std(swing), rel=0.5)
+        assert "led1 alone" in swinging_text(light, share, rms)
+    assert named or swinging_text(light, share, rms) == ""
 
 
 def test_in_noise_no_curve_is_significant_and_none_has_a_share():
