@@ -34,6 +34,7 @@ UNPREDICTED = 9.0  # times the chi2 of fitted frames: errors three times as larg
 PREDICTS = "held-out frames"
 LIGHT = "light"
 HOMOGENEITY = "homogeneity"
+STANDS_OUT = "an effect stands out"
 RIVALS = "rivals calibrated"  # of pairs of effects of images, which are dear
 LAW = "no other law"  # of an effect that the model has already
 CLUTTER = "beyond clutter"  # of the strength, which parts of the data tell
@@ -270,7 +271,7 @@ def _is_anything_there(f: Findings, significant: bool) -> list[Condition]:
             structure += f"; excess {f.excess_sd:.2g} sd over a noise that repeats have measured"
     return [
         Condition(
-            "an effect stands out",
+            STANDS_OUT,
             f.p_family,
             LEVEL,
             significant,

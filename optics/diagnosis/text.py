@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from optics.diagnosis.decide import CURVE, HOMOGENEITY, PREDICTS, Findings, wander_text
+from optics.diagnosis.decide import CURVE, HOMOGENEITY, PREDICTS, STANDS_OUT, Findings, wander_text
 from optics.diagnosis.result import (
     NAMED,
     PLANS,
@@ -21,6 +21,7 @@ from optics.diagnosis.result import (
     Row,
     Shift,
     kinds_of,
+    leaves_nothing,
 )
 from optics.diagnosis.thresholds import CLEAR, CLUTTERED, EXCESS, LEVEL, MARGIN, MISSTATED, STRENGTH, SURE
 from optics.words import (
@@ -163,11 +164,18 @@ def sentence(
     if word == "CANNOT_TELL":
         last = [c for c in failing if c.name == CURVE]  # says more than all others together
         reasons = "; ".join(f"{c.name}: {c.text}" for c in last or failing) or "; ".join(c.text for c in conditions)
-        return f"misfit is left, but no verdict holds ({reasons}).{_so_far(f, explanations, basis)}"
+        return f"{_seen(conditions, basis)}, but no verdict holds ({reasons}).{_so_far(f, explanations, basis)}"
     winner = next(row for row in rows if row.name == f.winner)
     if word == "CLAIM":
         return _claim(f, winner, rows, explanations, levels, shifts, basis)
     return _partial(f, winner, failing)
+
+
+def _seen(conditions: Sequence[Condition], basis: Basis) -> str:
+    """What asks for an effect where none is named."""
+    if not leaves_nothing(basis.structure_p, basis.excess_sd):
+        return "misfit is left"
+    return "an effect stands out" if any(c.name == STANDS_OUT and c.holds for c in conditions) else "structure is left"
 
 
 def _so_far(f: Findings, explanations: Sequence[Explanation], basis: Basis) -> str:

@@ -1222,3 +1222,16 @@ def test_nobody_turned_what_is_absent():
     assert "sample.angle" not in fingerprints.settings(model, evidence)
     model.captures.absent = ()
     assert fingerprints.settings(model, evidence)["sample.angle"] == [15.0 * i for i in range(6)]
+
+
+@pytest.mark.parametrize(
+    ("excess", "p", "said"),
+    [(8.0, 1e-9, "misfit is left"), (0.6, 1.0, "an effect stands out"), (5.5, 0.5, "misfit is left")],
+)
+def test_what_is_left_is_said_as_it_is(excess, p, said):
+    """Misfit that a table of numbers shows to be none is not said to be left."""
+    from optics.diagnosis.decide import STANDS_OUT
+    from optics.diagnosis.text import _seen
+
+    conditions = [SimpleNamespace(name=STANDS_OUT, holds=True)]
+    assert _seen(conditions, SimpleNamespace(excess_sd=excess, structure_p=p)) == said
