@@ -53,6 +53,19 @@ FAMILIES = {  # what a coordinate belongs to; a setting belongs to the family of
     "time": ("frame", "reading"),
 }
 
+EDGES = "a change that depends on edges mixes pixels: use the stage 'lens' (plugins/effects/lens_blur.py)"
+NO_DRAFT = {  # coordinates along which no effect can be drafted: why, and what to do instead
+    "intensity": "a curve along the radiance before the camera bends it is no image function; draft along 'signal'",
+    "frame": "a number per frame says nothing of the next frame; 'gain drift' frees a gain per frame",
+    "site": "an analyser's own level is its gain: 'site gain' frees one for each angle of a mosaic",
+    "reading": "the row of a table is no setting; add a column `source.time` with the time of each reading, or one "
+    "of what else changed",
+    "LED": "an LED's own level is its power, which a calibration solves for; light besides it comes in some frames and "
+    "not in others: see in which; or draft along 'led_distance' or 'led_angle'",
+    "gradient": EDGES,
+    "laplacian": EDGES,
+}
+
 
 def family_of(coordinate: str, of_setting: str = "") -> str:
     """camera, light, geometry, time or setting; `of_setting` is what the model says of a setting

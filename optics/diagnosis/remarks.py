@@ -13,6 +13,7 @@ from optics.diagnosis import statistics as st
 from optics.diagnosis.decide import CURVE, HOMOGENEITY, PREDICTS, Findings
 from optics.diagnosis.evidence import Candidate, Evidence, at_bound, measure, priors
 from optics.diagnosis.explanations import Outcome, Trial
+from optics.diagnosis.fingerprints import NO_DRAFT
 from optics.diagnosis.refit import Case
 from optics.diagnosis.result import NAMED, Basis, Condition, Shift, Split
 from optics.diagnosis.score import KAPPA, Table
@@ -333,6 +334,8 @@ def hints_of(
             f"write an effect with the law that this sensor follows ({findings.law}), or state the errors of settings "
             "under [uncertainty]"
         )
+    elif word == "UNKNOWN" and findings.coordinate in NO_DRAFT:
+        hints.append(f"no effect can be drafted along '{findings.coordinate}': {NO_DRAFT[findings.coordinate]}")
     elif word == "UNKNOWN":
         hints.append(
             "draft an effect from the curve (optics effects new NAME --from STUDY), add it, and diagnose again"

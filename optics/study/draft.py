@@ -28,7 +28,7 @@ from pathlib import Path
 
 import numpy as np
 
-from optics.diagnosis.fingerprints import SIDE, family_of
+from optics.diagnosis.fingerprints import NO_DRAFT, SIDE, family_of
 from optics.diagnosis.result import Diagnosis, Fingerprint
 from optics.errors import OutputExists, UnknownKey
 from optics.files.output import write_text
@@ -123,18 +123,6 @@ CARRIERS = {
     ),
     "led_angle": Carrier("emission", (ANGLE.format("beam.cos"),), "angle to the LED's axis, deg"),
 }
-EDGES = "a change that depends on edges mixes pixels: use the stage 'lens' (plugins/effects/lens_blur.py)"
-ELSEWHERE = {  # coordinates that carry no table, and what to do instead
-    "intensity": "a curve along the radiance before the camera bends it is no image function; draft along 'signal'",
-    "frame": "a number per frame says nothing of the next frame; 'gain drift' frees a gain per frame",
-    "site": "an analyser's own level is its gain: 'site gain' frees one for each angle of a mosaic",
-    "reading": "the row of a table is no setting; add a column `source.time` with the time of each reading, or one "
-    "of what else changed",
-    "LED": "an LED's own level is its power, which a calibration solves for; draft along 'led_distance' or 'led_angle'",
-    "gradient": EDGES,
-    "laplacian": EDGES,
-}
-
 VIEWS = {  # stage: (the function's arguments, the line that applies a curve, of the variable `curve`)
     "lens": ("image, camera", "return image * (1 + camera.{name} * {curve})[..., None]"),
     "sensor": ("image, camera", "return image * (1 + camera.{name} * {curve})"),
@@ -364,7 +352,7 @@ def fingerprint_of(diagnosis: Diagnosis, along: str | None) -> Fingerprint:
     if along not in known:
         raise UnknownKey(along, known, "coordinate", hint=f"(of this diagnosis; {offer})")
     if along not in can:
-        why = ELSEWHERE.get(along, "no stage of a model sees it")
+        why = NO_DRAFT.get(along, "no stage of a model sees it")
         raise ValueError(f"no draft along '{along}': {why}; {offer}")
     return known[along]
 
