@@ -862,3 +862,15 @@ def test_regions_tell_a_wrong_mean_from_a_wide_spread():
         list(images), [np.zeros((32, 48, 1))] * 12, [np.ones((32, 48, 1))] * 12, [np.ones((32, 48, 1), bool)] * 12
     )
     assert float(regions(c)["worst"]) < 0.2
+
+
+def test_a_draft_is_advised_only_along_what_a_draft_can_follow():
+    from optics.diagnosis.remarks import hints_of
+
+    def hints(coordinate):
+        outcome = SimpleNamespace(survivors=[])
+        findings = SimpleNamespace(shared=False, another_law=False, law="", coordinate=coordinate)
+        return " ".join(hints_of("UNKNOWN", [], outcome, findings, [], []))
+
+    assert "optics effects new NAME --from STUDY" in hints("radius")
+    assert "no effect can be drafted along 'LED'" in hints("LED") and "effects new" not in hints("LED")
