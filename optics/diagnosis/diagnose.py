@@ -455,7 +455,7 @@ def _unexplained(
     hints = [DRIFT_HINT] * bool(drifting) + [FIXED_HINT] * ("same in every frame" in fixed)
     if light:
         hints.append(
-            f'state how steady it is ([uncertainty] "{light}.power" = {swing:.1g} in captures.toml, of the power that '
+            f'state how steady it is ([uncertainty] "{light}.power" in captures.toml, {swing:.1g} times the power that '
             "frames set), calibrate again, and diagnose what is left"
         )
     return " ".join(filter(None, parts)), hints

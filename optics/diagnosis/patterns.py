@@ -78,8 +78,14 @@ def fixed_pattern(
     if not use.any() or not excess > 0:
         return math.nan
     by_gains, gains = float(np.sum(along[use] ** 2 / length[use])), int(use.sum())
-    left = (float(square[use].sum()) - by_gains) / max(float(count[use].sum()) - gains, 1.0)
-    return (by_gains - gains * max(left, 1.0)) * evidence.thinning / excess
+    return _beyond_noise(by_gains, gains, float(square[use].sum()), int(count[use].sum())) * evidence.thinning / excess
+
+
+def _beyond_noise(explained: float, numbers: int, square: float, count: int) -> float:
+    """What so many numbers explain of `count` values whose squares sum to `square`, less what they explain of noise:
+    as an analysis of variance has it, by what they leave, so that noise which is stated too small is no pattern."""
+    left = (square - explained) / max(count - numbers, 1)
+    return explained - numbers * max(left, 1.0)
 
 
 def swinging_light(model: Model, evidence: Evidence, excess: float) -> tuple[str, float, float]:
@@ -100,18 +106,17 @@ def swinging_light(model: Model, evidence: Evidence, excess: float) -> tuple[str
     found = []
     for light, columns in lights.items():
         powers = np.array([value_of(model, evidence.values, evidence.columns[i]) for i in columns])
-        change, along, left, count = [], 0.0, 0.0, 0
+        change, along, square, count = [], 0.0, 0.0, 0
         for block in evidence.blocks:
             image = block.columns(columns) @ powers
             length = float(image @ image)
             if length > 0:
                 change.append(float(image @ block.r) / length)
                 along += change[-1] ** 2 * length
-                left, count = left + float(block.r @ block.r) - change[-1] ** 2 * length, count + len(block.r)
+                square, count = square + float(block.r @ block.r), count + len(block.r)
         if len(change) >= REPEATED:
-            chance = len(change) * max(left / max(count - len(change), 1), 1.0)
-            swing = math.sqrt(float(np.mean(np.square(change))))
-            found.append(((along - chance) * evidence.thinning / excess, light, swing))
+            share = _beyond_noise(along, len(change), square, count) * evidence.thinning / excess
+            found.append((share, light, math.sqrt(float(np.mean(np.square(change))))))
     found.sort(reverse=True)
     if len(found) < 2 or found[0][0] < HALF or found[1][0] > found[0][0] / 2:
         return "", math.nan, math.nan

@@ -123,6 +123,7 @@ CARRIERS = {
     ),
     "led_angle": Carrier("emission", (ANGLE.format("beam.cos"),), "angle to the LED's axis, deg"),
 }
+
 VIEWS = {  # stage: (the function's arguments, the line that applies a curve, of the variable `curve`)
     "lens": ("image, camera", "return image * (1 + camera.{name} * {curve})[..., None]"),
     "sensor": ("image, camera", "return image * (1 + camera.{name} * {curve})"),

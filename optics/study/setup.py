@@ -423,7 +423,7 @@ def _untouched(model: SceneModel, frames: Sequence[int]) -> bool:
     of_presses = [key for key, p in model.parameters.items() if p.free == "press"]
 
     def depth(frame: int, key: str) -> Any:
-        stated = model.frames[frame].parameters
+        stated = {**model.captures.parameters, **model.frames[frame].parameters}
         return stated.get(key, math.nan if any(k in stated for k in of_presses) else model.base[key])
 
     return bool(keys) and all(depth(i, key) == 0 for key in keys for i in frames)

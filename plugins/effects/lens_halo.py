@@ -14,7 +14,7 @@ Fingerprint
 Validity
     one halo over the whole field and for all colours.
 References
-    McCann & Rizzi, The Art and Science of HDR Imaging, Wiley 2012, ch. 11 (glare spread functions); ISO 9358:1994.
+    McCann & Rizzi, The Art and Science of HDR Imaging, Wiley 2012 (glare); ISO 9358:1994.
 """
 
 from types import SimpleNamespace
