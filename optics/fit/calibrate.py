@@ -39,7 +39,7 @@ EXCESS = 3.0  # sd of chi2 above its degrees of freedom, from which a misfit is 
 SHORT = 8  # linearisations of such a descent, before it is known to lead anywhere
 LEAD = 10.8  # of chi2, by which another start must be better: a lead that noise alone takes in 1 of 1000 cases
 LEADS = 0.01  # of the excess of chi2, by which it must: ten times what is NEGLIGIBLE to where each of the two ends
-FOLLOWED = 0.05  # of the promise: what a step around the bend of a valley must gain to be followed by another
+FOLLOWED = 0.25  # of the promise: what a step around the bend of a valley must gain to be followed by another
 TRIES = 4  # linearisations close to the optimum, before a fit that no longer gains ends
 CHORD_DAMPING = 1e-6  # of `extended`, which starts at the base's optimum: only directions that nothing determines
 
@@ -290,7 +290,7 @@ def _descend(
     stopped). Leaves the descent at the best point."""
     count = len(descent.variables)
     history: list[float] = []
-    best, tries = (np.inf, descent.theta, descent.values), 0
+    best, tries = (np.inf, np.inf, descent.theta, descent.values), 0
     for iteration in range(max_iterations):
         normal = descent.linearise(tick)
         _require_data(descent, normal)
@@ -308,15 +308,15 @@ def _descend(
             return history, f"not followed: the linear model promised a fall of {promise:.3g}, and more was asked for"
         near = promise < NEAR * count
         if near:
-            tries += 1
             descent.creep()
-            if promise < best[0]:
-                best = (promise, descent.theta, descent.values)
+            if normal.total + promise < best[0] + best[1]:  # as rough as chi2 is, what is promised counts beside it
+                best = (promise, normal.total, descent.theta, descent.values)
+            if descent.around() > FOLLOWED * promise:
+                continue
+            tries += 1
             # the last steps gained less than a quarter of what is promised, or good enough was reached before
             stuck = len(history) > 1 and history[-2] - promise / 4 < history[-1]
             if (tries > TRIES and stuck) or (tries > 1 and best[0] < count / 2):
-                if best[0] >= count / 2 and descent.around() > FOLLOWED * promise:
-                    continue
                 break
         gained = descent.chord(
             STEPS_NEAR if near else STEPS,
@@ -331,7 +331,7 @@ def _descend(
             return history, f"no lower misfit within reach; the linear model still promised {promise:.3g}"
     else:
         return history, f"stopped after {max_iterations} linearisations without converging; allow more or start nearer"
-    descent.theta, descent.values = best[1:]
+    descent.theta, descent.values = best[2:]
     if best[0] < count:
         return history, _converged(len(history))
     return history, f"the linear model still promised a fall of {best[0]:.3g}, which no step brought"

@@ -38,8 +38,8 @@ EASING = 10.0  # factor between one damping and the next, as Marquardt has it
 LEAST_DAMPING = 1e-9  # below the eigenvalue of a degenerate mode (`result.DEGENERATE`), which may then be followed
 MOST_DAMPING = 1e4  # leaves a ten-thousandth of the step along the gradient: a shorter one is no progress
 SCALED = 2.0  # times the truth: a power that starts further off is solved for before all else
-ON_THE_WAY = 0.1  # of a step: where the second derivative along it is measured
-HALVINGS = 8  # lengths of such a step that are tried
+HALVINGS = 4  # lengths of a step around the bend of a valley that are tried
+CORRECTIONS = 2  # predictions that lead each back to the valley's floor
 HUBER = 3.0  # standard deviations beyond which a robust fit lowers the weight of a value
 
 
@@ -248,6 +248,7 @@ class Descent:
         self.curved: np.ndarray
         self.slope: np.ndarray  # d theta / d coordinate at `at`
         self.trust, self.bent = 1.0, False
+        self.stride = 1.0  # part of a step that led furthest down a valley
         self.powers = [i for i, v in enumerate(self.variables) if model.linear_in(v)]
 
     def moved(self, values: Values, theta: np.ndarray) -> Values:
@@ -294,24 +295,32 @@ class Descent:
         return np.clip(moved, self.lowest, self.high)
 
     def around(self) -> float:
-        """Follow a narrow valley that bends, by geodesic acceleration (Transtrum & Sethna, arXiv 1201.5885): the best
-        of the steps t u + t^2 c with A c = -J'W f''(u)/2, where f'' comes from one prediction on the way. Returns the
-        gain."""
-        u, a, b = self._straight(0.0)  # as far as it goes: shorter ones are tried
-        part = self._at(self._stepped(ON_THE_WAY * u))[2].b * self.slope
-        second = 2 / ON_THE_WAY**2 * (b - ON_THE_WAY * (a @ u) - part)
-        free = np.full(len(u), np.inf)
-        c = -solve(a, second, -free, free) / 2
-        gained, t = 0.0, 1.0
+        """Follow a narrow valley that bends. Returns the gain.
+
+        A part t of the step u should leave b - t A u of the slope b. Where images bend it leaves more, and
+        corrections by the same images lead back to the valley's floor: s <- s + A^-1 (b(theta + s) - b + t A u). The
+        first is the geodesic acceleration of Transtrum & Sethna (arXiv 1201.5885), with the bend measured over the
+        step itself, where shadow rims that cross pixels are small beside it."""
+        u, a, b = self._straight(self.damping)
+        promised, free = float(2 * b @ u - u @ a @ u), np.full(len(u), np.inf)
+        best: tuple[np.ndarray, Values, Normal] | None = None
+        gained, t = 0.0, min(2 * self.stride, 1.0)
         for _ in range(HALVINGS):
-            found = self._at(self._stepped(t * u + t**2 * c))
-            gain = self.here.total - found[2].total
-            if gain > gained:
-                gained, best = gain, found
-            elif gained:
+            s, expected, length = t * u, GOOD * t * (2 - t) * promised, t
+            for n in range(CORRECTIONS + 1):
+                found = there = self._at(self._stepped(s))
+                if self.powers and n == 0 and not self.here.total - found[2].total > expected:
+                    found = min(there, self._settled(*there[:2]), key=lambda x: x[2].total)
+                gain = self.here.total - found[2].total
+                if gain > gained:
+                    gained, best, self.stride = gain, found, t
+                if gain > expected or n == CORRECTIONS:
+                    break
+                s = s + solve(a, there[2].b * self.slope - b + t * (a @ u), -free, free)
+            if gained > expected or (best is not None and self.stride > length):
                 break
             t /= 2
-        if gained:
+        if best is not None:
             self.theta, self.values, self.here = best
         return gained
 

@@ -204,6 +204,7 @@ PARAMETERS = (
         neutral=0.0,
         plausible=0.02,
         how="difference",
+        step=1.0,  # rims of shadows must cross several of the finer samples
     ),
     Parameter(
         "flattening",
