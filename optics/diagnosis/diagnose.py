@@ -27,6 +27,7 @@ from optics.diagnosis import competition, explanations, homogeneity, patterns, r
 from optics.diagnosis import fingerprints as prints
 from optics.diagnosis import held_out as held
 from optics.diagnosis import statistics as st
+from optics.diagnosis.by_frame import in_some_frames
 from optics.diagnosis.decide import Findings, decide
 from optics.diagnosis.dials_as_rival import with_rivals
 from optics.diagnosis.evidence import Candidate, Progress, silent
@@ -272,6 +273,10 @@ def _written(
         hints = [*first, *hints]
     else:
         text = " ".join(filter(None, [text, lamp]))
+    if word in ("UNKNOWN", "CANNOT_TELL", "PARTIAL"):
+        least = max([f.net for f in judged.fingerprints], default=0.0)
+        if found := in_some_frames(model, evidence, table.order, least, _excess(basis)):
+            text, hints = f"{found.text()} {text[0].upper()}{text[1:]}", [found.advice(), *hints]
     # of one press, what is fixed in the image and what is the surface's own look the same
     if leaves_misfit(best.excess_sd, basis) and not (
         FIXED_HINT in hints and len(patterns.presses_of(model, evidence)) < 2

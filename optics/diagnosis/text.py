@@ -363,7 +363,7 @@ def _unknown(f: Findings, curve: Fingerprint, basis: Basis) -> str:
     text = (
         f"structure is left that depends on '{curve.coordinate}': a curve along it explains {best}. "
         f"As {'a gain' if curve.kind == 'gain' else 'an offset'}, it is largest at {where}: {size}. "
-        "No effect of the library has this shape."
+        "No effect of the library has this shape with one strength."
     )
     if (beyond := math.sqrt(max(basis.misfit**2 - basis.noise**2, 0.0))) < CLUTTERED:
         text += (

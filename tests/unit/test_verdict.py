@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from optics.captures.noise import Noise
+from optics.diagnosis import by_frame, fingerprints, homogeneity, pairs
 from optics.diagnosis import decide as decide_rules
-from optics.diagnosis import fingerprints, homogeneity, pairs
 from optics.diagnosis import statistics as st
 from optics.diagnosis.correlation import Correlation
 from optics.diagnosis.decide import Findings, decide
@@ -279,6 +279,37 @@ def test_a_proxy_is_uneven():
     split = next(s for s in d.splits if s.by == "channel")
     assert not split.holds and split.h > 0.1 and split.strength[0] > 2 > 0.5 > abs(split.strength[1])
     assert any("between which its strength differs most" in h for h in d.hints)
+
+
+def test_an_effect_that_some_frames_show_and_others_do_not_is_named_with_both():
+    """Light that was switched on in one frame. With one strength for all, it explains nothing: powers take it up."""
+    model, fit = calibrated({"glare": [0.0, 0.02, 0.0, 0.0, 0.02, 0.0]}, seed=2)
+    d = judge(model, fit, library("glare", "gamma", "crosstalk"))
+    names = [model.frames[f].name for f in FITTED]
+    bare = ", ".join(names[:1] + names[2:])
+    assert d.word in ("PARTIAL", "UNKNOWN", "CANNOT_TELL")
+    assert d.sentence.startswith(f"Glare acts in some frames only: in {names[1]}, and not in {bare}. ")
+    assert d.hints[0].startswith(f"if what causes glare was off in {bare}, say so in captures.toml (")
+    assert '"sensor.glare" = 0 under [frames.parameters]' in d.hints[0]
+    for other in ("vignetting", "drift", "stain", "height", "weak"):
+        assert "in some frames only" not in case(other).text()
+
+
+@pytest.mark.parametrize(
+    "strength, sd, shown, bare",
+    [
+        ([1.2, 0.0, 1.3, -0.1, 0.05], 0.1, [0, 2], [1, 3, 4]),
+        ([1.2, 0.0, 1.3, -0.1, 0.32], 0.1, None, None),  # one has a quarter of it
+        ([1.2, 0.0, 1.3, -0.1, -0.9], 0.1, None, None),  # light is never less than none
+        ([1.2, 0.0, 1.3, -0.1, 0.5], 0.2, [0, 2], [1, 3]),  # the last may be either
+        ([1.0, 1.0, 1.1, 0.0, 0.9], 0.1, None, None),  # one frame that lacks it may be a mistake of its own
+        ([0.1, 0.0, 0.1, -0.1, 0.1], 0.1, None, None),
+    ],
+)
+def test_frames_show_an_effect_or_do_not(strength, sd, shown, bare):
+    c = SimpleNamespace(sides=[1])
+    found = by_frame._shown(c, np.array(strength), np.full(len(strength), sd))
+    assert found == (None if shown is None else (shown, bare))
 
 
 def test_what_the_data_cannot_tell_apart_is_a_set():
