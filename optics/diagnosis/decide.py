@@ -37,6 +37,7 @@ HOMOGENEITY = "homogeneity"
 STANDS_OUT = "an effect stands out"
 RIVALS = "rivals calibrated"  # of pairs of effects of images, which are dear
 LAW = "no other law"  # of an effect that the model has already
+KEPT = "no other value"  # of what the calibration keeps
 CLUTTER = "beyond clutter"  # of the strength, which parts of the data tell
 NO_DETAIL = "no detail"  # of what is not decided
 PLAUSIBLE = "plausible"  # strengths for what the effect adds
@@ -86,6 +87,8 @@ class Findings:
                  of effects with a strength per frame
     law          an effect that the model has, and the coordinate along which another law of it explains most; ''  for
                  none that is significant; law_lead: of the best explanation's score over that law's
+    fixed        a value that the calibration keeps, and the one that explains most, in words; '' for none that explains
+                 much; fixed_fall: of chi2 with it free; fixed_lead: of the best explanation's score over that value's
     fragile      an effect that other weights or masks prefer clearly, '' for none
     untried      explanations without the winner that may do better by their scores, and were not refitted, in words
     run_away     a power that has run away from the others, in words (optics.fit.run_away)
@@ -137,6 +140,9 @@ class Findings:
     carried_by: str = ""
     law: str = ""
     law_lead: float = math.inf
+    fixed: str = ""
+    fixed_fall: float = 0.0
+    fixed_lead: float = math.inf
     fragile: str = ""
     detail_of: str = ""
     adds: float = math.inf
@@ -152,6 +158,11 @@ class Findings:
     def another_law(self) -> bool:
         """Whether another law of an effect that the model has does clearly better than the best explanation."""
         return self.law_lead < -TOLD
+
+    @property
+    def another_value(self) -> bool:
+        """Whether another value of what the calibration keeps does clearly better than the best explanation."""
+        return self.fixed_lead < -TOLD
 
     @property
     def structured(self) -> bool:
@@ -208,6 +219,10 @@ def _by_fitted(f: Findings) -> tuple[str, list[Condition]]:
         )
         if not f.structured and not f.weighed:
             return "NOTHING", conditions
+    if f.another_value and f.structured:
+        if not any(c.name == KEPT for c in conditions):
+            conditions.append(_kept(f))
+        return "CANNOT_TELL", conditions
     if f.another_law and f.structured:
         return "UNKNOWN", conditions
     if f.rival and f.structured:
@@ -251,9 +266,9 @@ def _word_of_winner(f: Findings, failed: set[str]) -> str:
     if f.curve_lead > TOLD:
         bars.add("no better curve")
     alone = not failed & bars
-    alone = alone and not f.another_law
-    rivals = f.survivors > 1 or f.shared or LAW in failed or bool(f.fragile) or bool(f.unset) or bool(f.untried)
-    if failed & {"lead", LAW, "robust", DIALS, RIVALS, NO_DETAIL} and alone and f.some_even and rivals:
+    alone = alone and not f.another_law and not f.another_value
+    rivals = f.survivors > 1 or f.shared or failed & {LAW, KEPT} or bool(f.fragile) or bool(f.unset) or bool(f.untried)
+    if failed & {"lead", LAW, KEPT, "robust", DIALS, RIVALS, NO_DETAIL} and alone and f.some_even and rivals:
         return "AMBIGUOUS"
     some = failed - {"spread", NO_DETAIL}
     return "PARTIAL" if some and some <= {"share", HOMOGENEITY} else ""
@@ -348,6 +363,7 @@ def _against_causes_outside(f: Findings) -> list[Condition]:
             if f.law
             else "no freer law of an added effect explains it",
         ),
+        _kept(f),
         _unless(
             f.unset,
             DIALS,
@@ -379,6 +395,16 @@ def _against_causes_outside(f: Findings) -> list[Condition]:
             f"with it the model still misses the images by {percent(f.left)} of their mean, {FAR:.0%} allowed",
         ),
     ]
+
+
+def _kept(f: Findings) -> Condition:
+    """The winner against values that the calibration keeps."""
+    text = (
+        f"{f.fixed_lead:.3g} ahead of another value of {f.fixed}, {SURE:.3g} needed"
+        if f.fixed
+        else "no value that the calibration keeps explains it"
+    )
+    return Condition(KEPT, f.fixed_lead, SURE, f.fixed_lead > SURE, text)
 
 
 def _of_the_strength(f: Findings) -> list[Condition]:

@@ -33,6 +33,7 @@ from optics.diagnosis.dials_as_rival import with_rivals
 from optics.diagnosis.evidence import Candidate, Progress, silent
 from optics.diagnosis.explanations import Outcome
 from optics.diagnosis.findings import basis_of, findings_of, followed, subject_of
+from optics.diagnosis.fixed_values import FixedValue, best_of_fixed
 from optics.diagnosis.laws import other_laws
 from optics.diagnosis.refit import COARSE, Case, Cooled, Expected, after_at, refit_each
 from optics.diagnosis.result import (
@@ -50,7 +51,7 @@ from optics.diagnosis.result import (
 )
 from optics.diagnosis.score import Scored, score
 from optics.diagnosis.text import leaves_misfit, sentence
-from optics.diagnosis.thresholds import CLEAR, EXCESS, LEVEL, MARGIN, MAX_SPLIT, SHARE, close
+from optics.diagnosis.thresholds import AS_GOOD, CLEAR, EXCESS, LEVEL, MARGIN, MAX_SPLIT, SHARE, SURE, close
 from optics.errors import Underdetermined
 from optics.fit import calibrate
 from optics.fit.model import Model
@@ -213,6 +214,7 @@ class Judged:
     splits: list[Split]
     shifts: list[Shift]
     findings: Findings
+    fixed: FixedValue | None
 
 
 def _judge(request: Request, case: Case, chosen: list[Candidate], fits: dict[str, Fit]) -> Judged:
@@ -236,7 +238,10 @@ def _judge(request: Request, case: Case, chosen: list[Candidate], fits: dict[str
     splits, chance = _split(case, outcome, subject, basis)
     shifts = held.shifts(case, best.members, best.fit) if subject else []
     findings = findings_of(case, outcome, fingerprints, laws, splits, chance, levels, basis)
-    return Judged(basis, outcome, subject, levels, fingerprints, families, laws, splits, shifts, findings)
+    fixed = best_of_fixed(case, outcome) if decide(findings)[0] != "NOTHING" else None
+    if fixed and not (findings.rival and fixed.fall < AS_GOOD * fingerprints[0].net):
+        findings = replace(findings, fixed=fixed.text(), fixed_fall=fixed.fall, fixed_lead=fixed.lead)
+    return Judged(basis, outcome, subject, levels, fingerprints, families, laws, splits, shifts, findings, fixed)
 
 
 def _written(
@@ -264,6 +269,8 @@ def _written(
         ambiguous.append(findings.fragile)
         kinds.append([findings.fragile])
     hints = remarks.hints_of(word, conditions, outcome, findings, gaps, names)
+    if judged.fixed and findings.fixed_lead <= SURE:
+        hints = [judged.fixed.advice(), *hints]
     if subject and word in NAMED:
         hints = [*remarks.replaced(case, best, request.added), *hints]
     text = sentence(word, conditions, findings, rows, records, judged.fingerprints, judged.levels, judged.shifts, basis)

@@ -159,6 +159,8 @@ def sentence(
         )
     if word == "UNKNOWN":
         return _unknown(f, next(c for c in fingerprints if c.coordinate == f.coordinate), basis)
+    if word == "CANNOT_TELL" and f.another_value:
+        return _another_value(f)
     if word == "CANNOT_TELL" and (missed := [c for c in failing if c.name == PREDICTS]):
         return f"nothing is missing in the frames that were fitted, but {missed[0].text}."
     if word == "CANNOT_TELL":
@@ -169,6 +171,14 @@ def sentence(
     if word == "CLAIM":
         return _claim(f, winner, rows, explanations, levels, shifts, basis)
     return _partial(f, winner, failing)
+
+
+def _another_value(f: Findings) -> str:
+    effects = f"the best explanation by effects by {f.fall:.4g}" if f.winner else "and no effect stands out beside it"
+    return (
+        f"misfit is left that another value of {f.fixed} explains. The calibration keeps this value. With it free chi2 "
+        f"falls by {f.fixed_fall:.4g}, {effects}."
+    )
 
 
 def _seen(conditions: Sequence[Condition], basis: Basis) -> str:
@@ -317,6 +327,12 @@ def _ambiguous(f: Findings, explanations: Sequence[Explanation]) -> str:
         return (
             f"the captures state no error of {f.unset}. Such errors act on each frame, as one strength per frame "
             f"does. The data do not decide between these errors and: {names}.{other}"
+        )
+    if f.fixed_lead <= SURE:
+        return (
+            f"the data do not decide between another value of {f.fixed}, which the calibration keeps "
+            f"({f.fixed_fall:.4g}), and {'this explanation' if count == 1 else f'{count} explanations'} (fall of "
+            f"chi2): {names}.{other}"
         )
     if f.law_lead <= SURE:
         return (

@@ -468,6 +468,12 @@ GOOD = Findings(
         ({"p_family": 0.02, "rival": True, "ratio": 3.0, "curve_share": 0.01}, "CANNOT_TELL"),
         ({"law": "b along frame", "law_lead": SURE + 0.1}, "CLAIM"),
         ({"law": "b along frame", "law_lead": SURE - 0.1}, "AMBIGUOUS"),  # as over any other rival
+        # what the calibration keeps: as over any other rival
+        ({"fixed": "gel.smoothing (0.25 +- 0.01 mm in place of 0.2)", "fixed_lead": SURE + 0.1}, "CLAIM"),
+        ({"fixed": "gel.smoothing (0.25 +- 0.01 mm in place of 0.2)", "fixed_lead": SURE - 0.1}, "AMBIGUOUS"),
+        ({"fixed": "gel.smoothing (0.25 +- 0.01 mm in place of 0.2)", "fixed_lead": -TOLD - 0.1}, "CANNOT_TELL"),
+        ({"fixed": "b.c (2 +- 1 in place of 1)", "fixed_lead": -TOLD - 0.1, "p_family": 0.02}, "CANNOT_TELL"),
+        ({"fixed": "b.c (2 +- 1 in place of 1)", "fixed_lead": -TOLD - 0.1, "rival": True}, "CANNOT_TELL"),
         ({"unset": "analyzer.angle"}, "AMBIGUOUS"),  # a gain of each frame, or a dial that was off in each
         # no effect and no structure on the fitted frames, and another world on the others
         ({"p_family": 0.5, "structure_p": 0.5, "base_fitted": 1.6, "base_held_out": 50.8}, "CANNOT_TELL"),

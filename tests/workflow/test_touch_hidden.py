@@ -3,6 +3,9 @@
 Three presses of 24 x 32 px and a dark frame; one press is held out. Candidates are the hidden effect and those that
 come nearest to it, so that a minute of the loop becomes seconds."""
 
+import re
+from dataclasses import replace
+
 import pytest
 
 from optics.proof.cells import Cell
@@ -52,3 +55,26 @@ def test_an_effect_hidden_in_a_sensor_is_named(rig, effect, tmp_path):
     assert sum(found.strength) == pytest.approx(strength, rel=near), diagnosis.sentence  # of a halo: both shares
     before, after = (level.chi2_held_out for level in diagnosis.levels)
     assert after < 1.1 < before  # 2304 values: chi2 per value scatters by 3 %
+
+
+def test_a_wrong_value_that_the_calibration_keeps_is_found(rig, tmp_path):
+    """The scene says that the skin smooths a dent by 0.15 mm. Nothing is missing, but a skirt of the dent explains what
+    that leaves, and would be claimed. With what is known stated as the verdict advises, nothing is left."""
+    rig.make(tmp_path / "captures", Cell(rig.name, "none", (), 0, 0.0, "same", "", 2))
+    right = rig.setup(tmp_path / "captures", 2)
+    setup = replace(right, values={**right.values, "gel.smoothing": 0.15})
+    study, model, fit = loop.begin(setup, tmp_path / "study")
+    tested = ("exponential skirt", "lens blur", "gel bulge", "lens halo", *OFTEN)
+    without = [e.name for e in loop.candidates(model, study) if e.name not in tested]
+    found = loop.examine(study, model, setup, fit, advised=False, without=without)
+    assert found.word == "CANNOT_TELL"
+    told = re.search(r"another value of gel.smoothing \((.*?) \+- (.*?) mm in place of 0.15\) explains", found.sentence)
+    assert told and abs(float(told[1]) - 0.25) < 4 * float(told[2]) < 0.1, found.sentence
+    assert '[uncertainty] "gel.smoothing" = 0.05 mm' in found.hints[0]
+    file = tmp_path / "captures" / "captures.toml"
+    said = '[parameters]\n"gel.smoothing" = 0.15\n\n[uncertainty]\n"gel.smoothing" = 0.05\n\n[[frames]]'
+    file.write_text(file.read_text().replace("[[frames]]", said, 1))
+    study, model, fit = loop.begin(rig.setup(tmp_path / "captures", 2), tmp_path / "another")
+    value = next(v for v in study.steps[0]["variables"] if v["name"] == "gel.smoothing")
+    assert abs(value["value"] - 0.25) < 4 * value["sd"]
+    assert loop.examine(study, model, setup, fit, advised=False, without=without).word == "NOTHING"
