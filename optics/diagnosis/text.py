@@ -43,8 +43,9 @@ MOST = 0.9  # of the excess: explanations of less are not all that is missing, a
 LEAST = 0.1  # D with the best shots, below which these leave two effects as alike as they are
 # what to check where no effect brings the model near its images
 AT_FAULT = (
-    "units, LEDs that were off, black_level, and that images are linear (not encoded for viewing) and whole, with row "
-    "0 at the top"
+    "units, LEDs that were off, black_level, that images are linear (not encoded for viewing) and whole, with row 0 at "
+    "the top, and that the camera stands and sees as the scene says (free what is not known: [uncertainty] "
+    '"camera.x" = 0.1 in captures.toml, in its unit)'
 )
 
 

@@ -17,19 +17,48 @@ from optics.fit.result import Fit
 from optics.fit.run_away import powers_apart
 from optics.fit.scene_model import SceneModel
 from optics.fit.tempering import weight_of
-from optics.scene.parameter import Values
+from optics.scene.parameter import Values, Variable
 from optics.study.setup import GROUPS, Setup
 from optics.words import some, spaced
 
 # of the noise: Monte Carlo error of a prediction below which it adds less than 5 % to the noise (in quadrature)
 CHANCE = 0.3
 COLLIMATED = 4.0  # of the face's width: the distance of a light from which its directions differ by 7 deg at most
+DIM, IMPOSSIBLE = 4.0, 10.0  # times the light of the images; sd of what is known of a power
+BRIGHT = 3  # frames that tell, the brightest
 SURPRISING = 3.0  # standard deviations of a prior, beyond which a calibrated value contradicts it
 
 
 def before_calibration(model: SceneModel, setup: Setup, held: Sequence[int]) -> list[str]:
     """Doubts about captures and scene, each once."""
     return [*of_captures(model), *_unverified(model, setup, held)]
+
+
+def require_light(model: SceneModel, values: Values, variables: Sequence[Variable], fitted: Sequence[int]) -> None:
+    """Raise ValueError where the model sends far more or less light than images show, and no free power may make up for
+    it: a calibration would take long to find that out."""
+    powers = [v for v in variables if model.linear_in(v) and model.family(v.keys[0]) == "light"]
+    if model.captures.table is not None or not powers or any(v.prior is None for v in powers):
+        return
+    scene, black = model.scene.values(), float(model.noise.black_level)
+    frames = sorted(fitted, key=lambda i: -float(np.sum(model.frames[i].image[model.usable(i)])))[:BRIGHT]
+    images = [model.frames[i].image[model.usable(i)] - black for i in frames]
+    sent = [image[model.usable(i)] - black for i, image in zip(frames, model.predict(values, frames))]
+    square = sum(float(np.sum(s**2)) for s in sent)
+    ratio = sum(float(np.sum(s * y)) for s, y in zip(sent, images)) / square if square else math.inf
+    known = [v.prior for v in powers if v.prior is not None]
+    beyond = min(abs(ratio - 1) * abs(value_of(model, values, v)) / prior[1] for v, prior in zip(powers, known))
+    if 1 / DIM < ratio < DIM or not beyond > IMPOSSIBLE:
+        return
+    v, prior = powers[0], known[0]
+    key = v.keys[0]
+    raise ValueError(
+        f"{model.captures.folder}: at its start the model sends {1 / ratio:.2g} times the light of the images, and "
+        f"what is known of the powers forbids to make up for it: {key} = {value_of(model, values, v):.4g} for "
+        f"{prior[0]:.4g} +- {prior[1]:.2g} (the scene has {scene[key]:.4g}). Allowed: {1 / DIM:g} to {DIM:g} times. "
+        f"Note in the frames the powers that the scene means, give another prior (--prior '{key}={prior[0] * ratio:.2g}"
+        f"+-{prior[1] * ratio:.2g}'), or correct the camera's exposure"
+    )
 
 
 def of_captures(model: SceneModel) -> list[str]:

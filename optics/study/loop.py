@@ -130,6 +130,7 @@ def begin(
     with record.alone():
         try:
             start, robust = Values(dict(setup.values)), setup.robust
+            checks.require_light(model, start, variables, fitted)
             coarser = coarser_models(model, setup, fitted, variables)
             with model.where_used():
                 if coarser:

@@ -54,6 +54,39 @@ def test_a_value_far_from_its_prior_is_named():
     )
 
 
+@pytest.mark.parametrize(
+    "power, sd, refused", [(1.0, 0.3, True), (1.0, 10.0, False), (1.0, None, False), (20.0, 0.3, False)]
+)
+def test_light_that_no_power_may_make_up_for_is_refused_at_once(power, sd, refused):
+    """Frames note powers of 1 where the scene means 40: a calibration would run for minutes to say so."""
+    lamp = Parameter("power", "1", 1.0, (0.0, 1e6), plausible=0.1, role="power", linear=True)
+    prior = None if sd is None else (1.0, sd)
+    variables = [Variable("lamp.power", ("lamp.power",), lamp, None, prior)]
+    light = np.linspace(1, 20, 12).reshape(3, 4, 1)
+    model = SimpleNamespace(
+        captures=SimpleNamespace(table=None, folder="captures"),
+        scene=SimpleNamespace(values=lambda: {"lamp.power": 40.0}),
+        noise=NOISE,
+        frames=[SimpleNamespace(image=64 + 40 * light, name=f"f{i}") for i in range(4)],
+        linear_in=lambda v: True,
+        family=lambda key: "light",
+        usable=lambda i: np.ones((3, 4, 1), bool),
+        predict=lambda values, frames: [64 + values.common["lamp.power"] * light for _ in frames],
+        drives=(),
+        at=lambda values, i: values.common,
+        base={"lamp.power": 1.0},
+    )
+    values = Values({"lamp.power": power})
+    if not refused:
+        checks.require_light(model, values, variables, range(4))
+        return
+    with pytest.raises(ValueError) as raised:
+        checks.require_light(model, values, variables, range(4))
+    told = str(raised.value)
+    assert "sends 0.025 times the light" in told and "1 for 1 +- 0.3 (the scene has 40)" in told
+    assert "--prior 'lamp.power=40+-12'" in told
+
+
 def test_a_light_that_ran_away_is_named_for_what_it_is():
     """A face of 10 mm: from 12 mm to 45 mm a light acts as a collimated one; to 20 mm, or where nobody said where it
     stood, it does not, or nobody knows."""
