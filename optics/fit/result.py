@@ -129,18 +129,32 @@ class Fit:
         sd = self.sd
         return {i for i in (*gauges.members, *gauges.silent) if sd[i] > HUGE * self.variables[i].parameter.plausible}
 
+    @property
+    def ended(self) -> list[str]:
+        """The variables of `at_bound` that stand at a bound, or are known to be off: of what is not determined, none
+        has come to its bound."""
+        if not self.at_bound:
+            return []
+        blurred, found = self.blurred(self.gauges), []
+        for i, v in enumerate(self.variables):
+            low, high = v.parameter.bounds
+            known = i not in blurred and v.parameter.reach.holds(self.estimate[i], self.sd[i])
+            if v.name in self.at_bound and (known or not low < self.estimate[i] < high):
+                found.append(v.name)
+        return found
+
     def table(self) -> str:
         """One line per variable: estimate, standard deviation, unit, start, and the strongest correlation. Of variables
         that only a combination of is determined, the combinations follow."""
         lines = [f"{'variable':<28}{'estimate':>12}{'+- sd':>11}  {'unit':<6}{'start':>11}   strongest correlation"]
         correlation = np.abs(self.correlation - np.eye(len(self.variables)))
         gauges = self.gauges
-        blurred = self.blurred(gauges)
+        blurred, ended = self.blurred(gauges), self.ended
         for i, variable in enumerate(self.variables):
             j = int(np.argmax(correlation[i])) if len(self.variables) > 1 else i
             other = f"{self.correlation[i, j]:+.2f} {self.variables[j].name}" if j != i else ""
             start = "" if self.start is None else f"{self.start[i]:11.5g}"
-            bound = "  at its bound" if variable.name in self.at_bound else ""
+            bound = "  at its bound" if variable.name in ended else ""
             number = f"{self.estimate[i]:12.5g}{self.error[i]:11.2g}"
             if i in blurred:
                 number = f"{self.estimate[i]:12.5g}{'unseen' if i in gauges.silent else 'gauge':>11}"
@@ -187,7 +201,8 @@ def warnings_of(result: Fit, a: np.ndarray) -> list[str]:
             "them, or give it a prior"
         )
     texts += _correlated(result, names, [set(), *map(set, modes), *held])
-    texts += [f"{n} ended at its bound" for n in result.at_bound]
+    together = {n for mode in modes for n in mode}
+    texts += [f"{n} ended at its bound" for n in result.ended if n not in together]
     if not result.converged:
         texts.append(result.reason)
     return texts

@@ -531,6 +531,19 @@ def test_priors_go_along_to_other_frames_where_they_say_something_about_them():
     assert [v.frames for v in for_frames(model, each, [4, 5])] == [(4,), (5,)]
 
 
+def test_what_is_not_determined_has_not_come_to_its_bound():
+    """Of two powers that only their product is known of, one runs low: an error of many times the value says nothing
+    about a bound. One that is known to be off, and one that stands at its bound, do."""
+    power = Parameter("power", "1", 1.0, (0.0, 1e3), plausible=0.1, multiplies=True)
+    variables = [Variable(n, (n,), power) for n in ("open", "off", "at")]
+    names = [v.name for v in variables]
+    covariance = np.diag([1e8, 1e-2, 1e-2])
+    result = Fit(None, variables, np.array([0.5, 1e-3, 0.0]), covariance, 1.0, 1, [], [], [], True, "", at_bound=names)
+    assert result.ended == ["off", "at"]
+    told = warnings_of(result, np.linalg.inv(covariance))
+    assert [t for t in told if "ended" in t] == ["off ended at its bound", "at ended at its bound"]
+
+
 def test_what_is_correlated_among_each_other_is_one_warning():
     names = [*(f"led_{i}.power" for i in range(1, 7)), "rho", "x", "y", "alone"]
     common = np.zeros((len(names), 3))
