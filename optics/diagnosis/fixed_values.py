@@ -31,6 +31,9 @@ from optics.words import spaced, with_sd
 VALUE = Effect("another value", part="scene", parameters=())
 VISIBLE = 3.0  # sd of an image, by which a plausible change must show in one frame to be asked about
 FEW = 3  # values that are calibrated, the best by first order
+# Roles of what is a state and no measure, and of what effects ask about in other words: an error of a film's angle, an
+# LED whose spectrum lies elsewhere.
+OTHERWISE = ("inserted", "approach", "clock", "angle", "light wavelength", "light width")
 PART = 0.5  # of what the best explanation explains, by first order, from which they are
 
 
@@ -82,7 +85,10 @@ def kept_values(model: SceneModel, case: Case) -> list[Variable]:
     """One variable for each number of a part that no calibration solves for and nobody states."""
     registry = model.scene.registry
     of_effects = {
-        (kind, name) for e in registry.effects.values() for kind in registry.kinds(e.part) for name in e.at_rest
+        (kind, name)
+        for e in registry.effects.values()
+        for kind in registry.kinds(e.part)
+        for name in (*e.parameter_names, *(p.name for p in e.shape))
     }
     free = {key for v in case.fit.variables for key in v.keys}
     stated = {key for f in case.fitted for key in (*model.frames[f].parameters, *model.frames[f].readings)}
@@ -92,7 +98,7 @@ def kept_values(model: SceneModel, case: Case) -> list[Variable]:
             key = f"{name}.{p.name}"
             if key in free | stated or (part.kind, p.name) in of_effects or p.neutral is not None or p.linear:
                 continue
-            if key in model.parameters and p.role != "clock":
+            if key in model.parameters and p.role not in OTHERWISE:
                 found.append(Variable(key, (key,), model.parameters[key]))
     return found
 

@@ -5,9 +5,11 @@ come nearest to it, so that a minute of the loop becomes seconds."""
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
 
+from optics.diagnosis.fixed_values import kept_values
 from optics.proof.cells import Cell
 from optics.proof.rigs.touch import Digit
 from optics.study import loop
@@ -64,6 +66,10 @@ def test_a_wrong_value_that_the_calibration_keeps_is_found(rig, tmp_path):
     right = rig.setup(tmp_path / "captures", 2)
     setup = replace(right, values={**right.values, "gel.smoothing": 0.15})
     study, model, fit = loop.begin(setup, tmp_path / "study")
+    asked = {v.name for v in kept_values(model, SimpleNamespace(fit=fit, fitted=fit.frames))}
+    assert {"gel.smoothing", "gel.indenter_size", "camera.x_fov", "camera.tilt"} < asked
+    # calibrated, set by frames, an effect's own, or asked about by an effect
+    assert not asked & {"led_red.x", "led_red.power", "gel.press_x", "gel.coat", "camera.k1", "led_red.wavelength"}
     tested = ("exponential skirt", "lens blur", "gel bulge", "lens halo", *OFTEN)
     without = [e.name for e in loop.candidates(model, study) if e.name not in tested]
     found = loop.examine(study, model, setup, fit, advised=False, without=without)
