@@ -275,15 +275,17 @@ def _written(
         hints = [*remarks.replaced(case, best, request.added), *hints]
     text = sentence(word, conditions, findings, rows, records, judged.fingerprints, judged.levels, judged.shifts, basis)
     lamp = remarks.lamp_text(case, outcome, basis)
+    partly = None
+    if word in ("UNKNOWN", "CANNOT_TELL", "PARTIAL"):
+        least = max([f.net for f in judged.fingerprints], default=0.0)
+        partly = in_some_frames(model, evidence, table.order, least, _excess(basis))
     if word in ("UNKNOWN", "CANNOT_TELL"):
-        text, first = _unexplained(case, word, text, lamp, judged.fingerprints, judged.families, findings, basis)
+        text, first = _unexplained(case, word, text, lamp, judged, bool(partly))
         hints = [*first, *hints]
     else:
         text = " ".join(filter(None, [text, lamp]))
-    if word in ("UNKNOWN", "CANNOT_TELL", "PARTIAL"):
-        least = max([f.net for f in judged.fingerprints], default=0.0)
-        if found := in_some_frames(model, evidence, table.order, least, _excess(basis)):
-            text, hints = f"{found.text()} {text[0].upper()}{text[1:]}", [found.advice(), *hints]
+    if partly:
+        text, hints = f"{partly.text()} {text[0].upper()}{text[1:]}", [partly.advice(), *hints]
     # of one press, what is fixed in the image and what is the surface's own look the same
     if leaves_misfit(best.excess_sd, basis) and not (
         FIXED_HINT in hints and len(patterns.presses_of(model, evidence)) < 2
@@ -443,15 +445,15 @@ def _unexplained(
     word: str,
     text: str,
     lamp: str,
-    fingerprints: Sequence[Fingerprint],
-    families: Sequence[Family],
-    findings: Findings,
-    basis: Basis,
+    judged: Judged,
+    partly: bool,
 ) -> tuple[str, list[str]]:
     """(sentence, what to do about patterns of the image) where no effect explains the residual.
 
-    lamp   what a lamp did to whole frames, in words: not said where one light of several is found to have done it"""
-    excess, best = _excess(basis), max([f.share for f in fingerprints], default=0.0)
+    lamp     what a lamp did to whole frames, in words: not said where one light of several is found to have done it
+    partly   whether an effect in some frames does"""
+    findings, fingerprints = judged.findings, judged.fingerprints
+    excess, best = _excess(judged.basis), max([f.share for f in fingerprints], default=0.0)
     pattern = partial(patterns.fixed_pattern, case.model, case.evidence, excess)
     fixed = patterns.fixed_text(pattern(), best, pattern(True), pattern(True, True))
     drift = patterns.drifting_pattern(case.model, case.fit.values, case.evidence, excess, case.seed)
@@ -461,9 +463,9 @@ def _unexplained(
     found = [part[0].upper() + part[1:] for part in texts if part]
     parts = [*found, text[0].upper() + text[1:] if found else text, "" if light else lamp]
     if word == "UNKNOWN" or findings.fall < SHARE * excess:
-        parts.append(prints.unexplained(fingerprints, findings.fall, excess))
+        parts.append(prints.unexplained(fingerprints, findings.fall, excess, bool(found) or partly))
     if word == "UNKNOWN" and not fixed and not (drifting and drift.share > best):
-        parts.append(prints.goes_with(families))
+        parts.append(prints.goes_with(judged.families))
     hints = [DRIFT_HINT] * bool(drifting) + [FIXED_HINT] * ("same in every frame" in fixed)
     if light:
         hints.append(

@@ -395,10 +395,11 @@ def goes_with(found: Sequence[Family]) -> str:
     return f"{text}; in brackets the best coordinate of each and how much {how}."
 
 
-def unexplained(found: Sequence[Fingerprint], best_effect: float, excess: float) -> str:
+def unexplained(found: Sequence[Fingerprint], best_effect: float, excess: float, patterned: bool = False) -> str:
     """One sentence: shares of the excess misfit that the best effect, the best curve, and neither of them explains.
 
     best_effect   net fall of chi2 with it;   excess: chi2 less its degrees of freedom
+    patterned     whether a pattern of another kind was named, which explains more: the rest is no mystery then
     """
     best = next((f for f in found if not f.per_frame), None)
     if not excess > 0 or best is None:
@@ -409,4 +410,4 @@ def unexplained(found: Sequence[Fingerprint], best_effect: float, excess: float)
         f"{curve:.0%}."
     )
     rest = f"{1 - max(effect, curve):.0%}"
-    return text if rest == "0%" else f"{text} Neither of them explains the other {rest}."
+    return text if patterned or rest == "0%" else f"{text} Neither of them explains the other {rest}."

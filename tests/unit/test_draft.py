@@ -325,6 +325,7 @@ def test_shares_of_curve_effect_and_remainder_add_up():
     assert unexplained([replace(row, net=2000.0)], 100.0, 1000.0) == (  # chance makes it more
         "The best effect explains 10% of the excess misfit, the best curve, along 'row', 100%."
     )
+    assert "Neither" not in unexplained([replace(row, net=900.0)], 100.0, 1000.0, True)  # a pattern has the rest
     assert unexplained(found, 100.0, 0.0) == ""  # within noise nothing has a share
 
 
