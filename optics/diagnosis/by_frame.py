@@ -5,7 +5,7 @@ powers of the lights take up. Here each frame has a strength s_f of its own,
 
     residual  =  base  +  sum over frames of s_f 1{frame f} d prediction / d s
 
-and the effect is named where this explains as much as a curve along frames, and each frame has either none of it or
+and the effect is named where this explains nearly as much as anything else, and each frame has either none of it or
 much."""
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from optics.diagnosis.thresholds import TOLD
 from optics.fit.model import Model
 from optics.words import share_text, some
 
-HALF = 0.5  # of the excess, from which such an effect is named
+HALF = 0.5  # of the excess, from which such an effect is named; of the largest strength, which bare frames surely lack
 NEARLY = 0.95  # of what the best curve along a coordinate explains: it has a gain and an offset for each frame
 LESS = 0.01  # of the best one's fall, by which another effect must explain less, and by TOLD, or it is named beside it
 SHOWN = 0.25  # of the largest strength: what a frame shows surely, if it shows the effect
@@ -50,7 +50,7 @@ class InSomeFrames:
         first, *others = self.effects
         also = f" (or {', or '.join(others)})" if others else ""
         return (
-            f"{first[0].upper()}{first[1:]}{also} acts in some frames only: in {some(self.shown, NAMES)}, and not in "
+            f"What is left looks like {first}{also} in some frames only: in {some(self.shown, NAMES)}, and not in "
             f"{some(self.bare, NAMES)}. With a strength for each frame it explains {share_text(self.share)} of the "
             "excess misfit."
         )
@@ -66,9 +66,10 @@ class InSomeFrames:
 def in_some_frames(
     model: Model, evidence: Evidence, candidates: Sequence[Candidate], least: float, excess: float
 ) -> InSomeFrames | None:
-    """The effect with a strength for each frame that explains most, if each frame has either none of it or much.
+    """The effect with a strength for each frame that explains most, if each frame has either none of it or much. Of
+    effects with one strength, whose images are linear in it.
 
-    least   fall of chi2 that it must reach: what a curve along frames brings
+    least   fall of chi2 that it must reach: what other explanations bring, curves among them
     excess  chi2 less its degrees of freedom
     """
     if evidence.is_table or not excess > 0:
@@ -96,15 +97,10 @@ def in_some_frames(
 
 def _with_a_strength_per_frame(evidence: Evidence, column: int) -> tuple[float, np.ndarray, np.ndarray]:
     """(fall of chi2 less its expectation, (frames,) strengths, their standard deviations) of the image in a column."""
-    frames, first = evidence.frames, len(evidence.columns)
-    normal = evidence.thinned(extra=len(frames))
-    for block in evidence.blocks:
-        bins = np.full(len(block.r), frames.index(block.frame))
-        image = block.columns([column])[:, 0]
-        st.add_bins(normal, block.where, block.middle, block.r, first, bins, len(frames), [image])
-    own = list(range(first, first + len(frames)))
-    projected = evidence.project(normal, evidence.base, own, evidence.thinning)
-    fall, dof, strength, sd = st.joint(projected, np.diag(normal.gram)[own])
+    frames = evidence.frames
+    images = (block.columns([column]) * (np.array(frames) == block.frame) for block in evidence.blocks)
+    projected, lengths = evidence.off_base(images, len(frames))
+    fall, dof, strength, sd = st.joint(projected, lengths)
     return (fall - dof) * evidence.thinning, strength, sd
 
 
@@ -116,10 +112,10 @@ def _shown(c: Candidate, strength: np.ndarray, sd: np.ndarray) -> tuple[list[int
         return None
     side = c.sides[0] or np.sign(strength[known][np.argmax(np.abs(strength[known]))])
     strength = strength * side
-    much = SHOWN * strength[known].max()
+    largest = strength[known].max()
     surely = known & (np.abs(strength) > SURELY * sd)
-    shown = surely & (strength > much)
-    bare = known & ~surely & (much / SHOWN / 2 - strength > SURELY * sd)
+    shown = surely & (strength > SHOWN * largest)
+    bare = known & ~surely & (HALF * largest - strength > SURELY * sd)
     if (surely & ~shown).any() or not shown.any() or bare.sum() < BARE:
         return None
     return list(np.flatnonzero(shown)), list(np.flatnonzero(bare))

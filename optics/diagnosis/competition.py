@@ -312,6 +312,14 @@ def _significant(case: Case, best: Trial, inner: Trial) -> float:
     return float(chdtri(max(free, 1), single))
 
 
+def held_against(case: Case, outcome: Outcome, rival: Trial) -> tuple[tuple[float, float], tuple[float, float]]:
+    """(lead, lead needed) of the best explanation over one of images that did not compete, and of that one over it."""
+    noise = lamp_noise(case, rival, outcome.scale)
+    rival.gain, rival.price = noise.gain, noise.price
+    rival.deviance = rival.after / outcome.scale - noise.gain
+    return _lead(case, outcome, outcome.best, rival), _lead(case, outcome, rival, outcome.best)
+
+
 def design_effect(case: Case, outcome: Outcome, one: Trial, other: Trial) -> float:
     """By how much the variance of the difference of two chi2 of images exceeds what independent noise makes."""
     direction = kept_values(case, [a - b for a, b in zip(one.images, other.images)])

@@ -88,7 +88,8 @@ class Findings:
     law          an effect that the model has, and the coordinate along which another law of it explains most; ''  for
                  none that is significant; law_lead: of the best explanation's score over that law's
     fixed        a value that the calibration keeps, and the one that explains most, in words; '' for none that explains
-                 much; fixed_fall: of chi2 with it free; fixed_lead: of the best explanation's score over that value's
+                 much; fixed_fall: of chi2 with it free; fixed_lead: of the best explanation over that value;
+                 fixed_needed: by a claim; fixed_wins: whether it is the value that leads
     fragile      an effect that other weights or masks prefer clearly, '' for none
     untried      explanations without the winner that may do better by their scores, and were not refitted, in words
     run_away     a power that has run away from the others, in words (optics.fit.run_away)
@@ -143,6 +144,8 @@ class Findings:
     fixed: str = ""
     fixed_fall: float = 0.0
     fixed_lead: float = math.inf
+    fixed_needed: float = SURE
+    fixed_wins: bool = False
     fragile: str = ""
     detail_of: str = ""
     adds: float = math.inf
@@ -161,8 +164,9 @@ class Findings:
 
     @property
     def another_value(self) -> bool:
-        """Whether another value of what the calibration keeps does clearly better than the best explanation."""
-        return self.fixed_lead < -TOLD
+        """Whether another value of what the calibration keeps does clearly better than the best explanation, and no
+        other law of an added effect does better still."""
+        return self.fixed_wins and self.structured and self.fixed_lead < self.law_lead
 
     @property
     def structured(self) -> bool:
@@ -219,7 +223,7 @@ def _by_fitted(f: Findings) -> tuple[str, list[Condition]]:
         )
         if not f.structured and not f.weighed:
             return "NOTHING", conditions
-    if f.another_value and f.structured:
+    if f.another_value:
         if not any(c.name == KEPT for c in conditions):
             conditions.append(_kept(f))
         return "CANNOT_TELL", conditions
@@ -270,7 +274,7 @@ def _word_of_winner(f: Findings, failed: set[str]) -> str:
     rivals = f.survivors > 1 or f.shared or failed & {LAW, KEPT} or bool(f.fragile) or bool(f.unset) or bool(f.untried)
     if failed & {"lead", LAW, KEPT, "robust", DIALS, RIVALS, NO_DETAIL} and alone and f.some_even and rivals:
         return "AMBIGUOUS"
-    some = failed - {"spread", NO_DETAIL}
+    some = failed - {"spread", NO_DETAIL, *(() if f.another_value else (KEPT,))}
     return "PARTIAL" if some and some <= {"share", HOMOGENEITY} else ""
 
 
@@ -400,11 +404,11 @@ def _against_causes_outside(f: Findings) -> list[Condition]:
 def _kept(f: Findings) -> Condition:
     """The winner against values that the calibration keeps."""
     text = (
-        f"{f.fixed_lead:.3g} ahead of another value of {f.fixed}, {SURE:.3g} needed"
+        f"{f.fixed_lead:.3g} ahead of another value of {f.fixed}, {f.fixed_needed:.3g} needed"
         if f.fixed
-        else "no value that the calibration keeps explains it"
+        else "none that the calibration keeps and that was asked about does as well"
     )
-    return Condition(KEPT, f.fixed_lead, SURE, f.fixed_lead > SURE, text)
+    return Condition(KEPT, f.fixed_lead, f.fixed_needed, f.fixed_lead > f.fixed_needed, text)
 
 
 def _of_the_strength(f: Findings) -> list[Condition]:

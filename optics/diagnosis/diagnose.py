@@ -51,7 +51,7 @@ from optics.diagnosis.result import (
 )
 from optics.diagnosis.score import Scored, score
 from optics.diagnosis.text import leaves_misfit, sentence
-from optics.diagnosis.thresholds import AS_GOOD, CLEAR, EXCESS, LEVEL, MARGIN, MAX_SPLIT, SHARE, SURE, close
+from optics.diagnosis.thresholds import AS_GOOD, CLEAR, EXCESS, LEVEL, MARGIN, MAX_SPLIT, SHARE, close
 from optics.errors import Underdetermined
 from optics.fit import calibrate
 from optics.fit.model import Model
@@ -238,9 +238,16 @@ def _judge(request: Request, case: Case, chosen: list[Candidate], fits: dict[str
     splits, chance = _split(case, outcome, subject, basis)
     shifts = held.shifts(case, best.members, best.fit) if subject else []
     findings = findings_of(case, outcome, fingerprints, laws, splits, chance, levels, basis)
-    fixed = best_of_fixed(case, outcome) if decide(findings)[0] != "NOTHING" else None
+    fixed = best_of_fixed(case, outcome, _excess(basis)) if decide(findings)[0] != "NOTHING" else None
     if fixed and not (findings.rival and fixed.fall < AS_GOOD * fingerprints[0].net):
-        findings = replace(findings, fixed=fixed.text(), fixed_fall=fixed.fall, fixed_lead=fixed.lead)
+        findings = replace(
+            findings,
+            fixed=fixed.text(),
+            fixed_fall=fixed.fall,
+            fixed_lead=fixed.lead,
+            fixed_needed=fixed.needed,
+            fixed_wins=fixed.wins,
+        )
     return Judged(basis, outcome, subject, levels, fingerprints, families, laws, splits, shifts, findings, fixed)
 
 
@@ -269,7 +276,7 @@ def _written(
         ambiguous.append(findings.fragile)
         kinds.append([findings.fragile])
     hints = remarks.hints_of(word, conditions, outcome, findings, gaps, names)
-    if judged.fixed and findings.fixed_lead <= SURE:
+    if judged.fixed and findings.fixed_lead <= findings.fixed_needed:
         hints = [judged.fixed.advice(), *hints]
     if subject and word in NAMED:
         hints = [*remarks.replaced(case, best, request.added), *hints]
@@ -278,6 +285,7 @@ def _written(
     partly = None
     if word in ("UNKNOWN", "CANNOT_TELL", "PARTIAL"):
         least = max([f.net for f in judged.fingerprints], default=0.0)
+        least = max(least, best.fall - best.expectation, findings.fixed_fall)
         partly = in_some_frames(model, evidence, table.order, least, _excess(basis))
     if word in ("UNKNOWN", "CANNOT_TELL"):
         text, first = _unexplained(case, word, text, lamp, judged, bool(partly))

@@ -7,7 +7,7 @@ take every usable pixel; curves, splits and alternative weights use a thinned la
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -270,6 +270,17 @@ class Evidence:
             b = None if block.b is None else block.b * w[:, None]
             normal.add(block.where, block.a * w[:, None], block.r * w, b)
         return normal
+
+    def off_base(self, images: Iterable[np.ndarray], count: int) -> tuple[st.Projected, np.ndarray]:
+        """(what the base leaves of further columns, their squared lengths), of the kept values.
+
+        images   (n, count) whitened, of each block in order"""
+        first = len(self.columns)
+        normal = self.thinned(extra=count)
+        for block, own in zip(self.blocks, images):
+            st.add_bins(normal, block.where, block.middle, block.r, first, np.zeros(len(block.r), int), 1, [*own.T])
+        columns = list(range(first, first + count))
+        return self.project(normal, self.base, columns, self.thinning), np.diag(normal.gram)[columns]
 
     def project(
         self, normal: st.Normal, base: Sequence[int], rest: Sequence[int], thinning: int = 1, noisy: bool = False

@@ -101,13 +101,8 @@ def _fall_of_images(evidence: Evidence) -> Judge:
     """(fall of chi2, dof, the same fall) of further images of each block."""
 
     def fall_of(images: Sequence[np.ndarray]) -> tuple[float, int, float]:
-        count, first = images[0].shape[1], len(evidence.columns)
-        normal = evidence.thinned(extra=count)
-        for block, own in zip(evidence.blocks, images):
-            st.add_bins(normal, block.where, block.middle, block.r, first, np.zeros(len(block.r), int), 1, [*own.T])
-        rest = list(range(first, first + count))
-        projected = evidence.project(normal, evidence.base, rest, evidence.thinning)
-        fall, dof, *_ = st.joint(projected, np.diag(normal.gram)[rest])
+        projected, lengths = evidence.off_base(images, images[0].shape[1])
+        fall, dof, *_ = st.joint(projected, lengths)
         return fall * evidence.thinning, dof, fall * evidence.thinning
 
     return fall_of

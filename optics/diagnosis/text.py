@@ -44,8 +44,8 @@ LEAST = 0.1  # D with the best shots, below which these leave two effects as ali
 # what to check where no effect brings the model near its images
 AT_FAULT = (
     "units, LEDs that were off, black_level, that images are linear (not encoded for viewing) and whole, with row 0 at "
-    "the top, and that the camera stands and sees as the scene says (free what is not known: [uncertainty] "
-    '"camera.x" = 0.1 in captures.toml, in its unit)'
+    "the top, and that the camera stands and sees as the scene says (what is not known is solved for if captures.toml "
+    "gives it under [parameters] and its error under [uncertainty])"
 )
 
 
@@ -329,7 +329,7 @@ def _ambiguous(f: Findings, explanations: Sequence[Explanation]) -> str:
             f"the captures state no error of {f.unset}. Such errors act on each frame, as one strength per frame "
             f"does. The data do not decide between these errors and: {names}.{other}"
         )
-    if f.fixed_lead <= SURE:
+    if f.fixed_lead <= f.fixed_needed:
         return (
             f"the data do not decide between another value of {f.fixed}, which the calibration keeps "
             f"({f.fixed_fall:.4g}), and {'this explanation' if count == 1 else f'{count} explanations'} (fall of "

@@ -311,14 +311,15 @@ def _descend(
             descent.creep()
             if normal.total + promise < best[0] + best[1]:  # as rough as chi2 is, what is promised counts beside it
                 best = (promise, normal.total, descent.theta, descent.values)
-            if descent.around() > FOLLOWED * promise:
+            followed = descent.around()
+            if followed > FOLLOWED * promise:
                 continue
             tries += 1
             # the last steps gained less than a quarter of what is promised, or good enough was reached before
             stuck = len(history) > 1 and history[-2] - promise / 4 < history[-1]
             if (tries > TRIES and stuck) or (tries > 1 and best[0] < count / 2):
                 break
-        gained = descent.chord(
+        gained = (followed if near else 0.0) + descent.chord(
             STEPS_NEAR if near else STEPS,
             WORTH * least,
             NEAR * count if near else 0.0,
@@ -330,7 +331,11 @@ def _descend(
         if gained < accuracy and not near:
             return history, f"no lower misfit within reach; the linear model still promised {promise:.3g}"
     else:
-        return history, f"stopped after {max_iterations} linearisations without converging; allow more or start nearer"
+        if best[0] >= count / 2:
+            return (
+                history,
+                f"stopped after {max_iterations} linearisations without converging; allow more or start nearer",
+            )
     descent.theta, descent.values = best[2:]
     if best[0] < count:
         return history, _converged(len(history))

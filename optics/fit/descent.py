@@ -280,12 +280,17 @@ class Descent:
 
     def _straight(self, damping: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(damped step, A, b), all in coordinates."""
+        low, high = self._room(damping)
+        a = (self.here.a + np.diag(self.curved)) * np.outer(self.slope, self.slope)
+        b = self.here.b * self.slope
+        return solve(a, b, low, high, damping), a, b
+
+    def _room(self, damping: float) -> tuple[np.ndarray, np.ndarray]:
+        """How far down and up a step may lead, in coordinates."""
         reach = self.trust * self.reach if damping else np.inf
         box = (self.theta, np.maximum(self.lowest, self.theta - reach), np.minimum(self.high, self.theta + reach))
         u, low, high = (np.array([v.parameter.coordinate(t) for v, t in zip(self.variables, values)]) for values in box)
-        a = (self.here.a + np.diag(self.curved)) * np.outer(self.slope, self.slope)
-        b = self.here.b * self.slope
-        return solve(a, b, low - u, high - u, damping), a, b
+        return low - u, high - u
 
     def _stepped(self, step: np.ndarray) -> np.ndarray:
         """Theta after a step in coordinates."""
@@ -302,7 +307,8 @@ class Descent:
         first is the geodesic acceleration of Transtrum & Sethna (arXiv 1201.5885), with the bend measured over the
         step itself, where shadow rims that cross pixels are small beside it."""
         u, a, b = self._straight(self.damping)
-        promised, free = float(2 * b @ u - u @ a @ u), np.full(len(u), np.inf)
+        low, high = self._room(self.damping)
+        promised = float(2 * b @ u - u @ a @ u)
         best: tuple[np.ndarray, Values, Normal] | None = None
         gained, t = 0.0, min(2 * self.stride, 1.0)
         for _ in range(HALVINGS):
@@ -314,9 +320,9 @@ class Descent:
                 gain = self.here.total - found[2].total
                 if gain > gained:
                     gained, best, self.stride = gain, found, t
-                if gain > expected or n == CORRECTIONS:
+                if gain > expected or n == CORRECTIONS or not np.isfinite(there[2].total):
                     break
-                s = s + solve(a, there[2].b * self.slope - b + t * (a @ u), -free, free)
+                s = s + solve(a, there[2].b * self.slope - b + t * (a @ u), low - s, high - s)
             if gained > expected or (best is not None and self.stride > length):
                 break
             t /= 2

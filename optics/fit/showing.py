@@ -25,7 +25,7 @@ def records(fit: Fit) -> list[dict[str, Any]]:
     prior_mean, prior_sd, pull = (value - prior_mean) / prior_sd, at_bound, gauge (whether only combinations of it with
     others are determined). None where there is no such number.
     """
-    out, members = [], fit.gauges.members
+    out, members, ended = [], fit.gauges.members, fit.ended
     for i, (v, value, sd) in enumerate(zip(fit.variables, np.asarray(fit.estimate, float), fit.sd)):
         mean, width = v.prior if v.prior is not None else (None, None)
         out.append(
@@ -42,7 +42,7 @@ def records(fit: Fit) -> list[dict[str, Any]]:
                 "prior_mean": mean,
                 "prior_sd": width,
                 "pull": None if mean is None or width is None else (float(value) - mean) / width,
-                "at_bound": v.name in fit.at_bound,
+                "at_bound": v.name in ended,
                 "gauge": i in members,
             }
         )

@@ -24,7 +24,8 @@ from optics.words import some, spaced
 # of the noise: Monte Carlo error of a prediction below which it adds less than 5 % to the noise (in quadrature)
 CHANCE = 0.3
 COLLIMATED = 4.0  # of the face's width: the distance of a light from which its directions differ by 7 deg at most
-DIM, IMPOSSIBLE = 4.0, 10.0  # times the light of the images; sd of what is known of a power
+# Times the light of the images, more than a reflectance that is free may make up for; sd of what is known of a power
+DIM, IMPOSSIBLE = 10.0, 10.0
 BRIGHT = 3  # frames that tell, the brightest
 SURPRISING = 3.0  # standard deviations of a prior, beyond which a calibrated value contradicts it
 
@@ -38,14 +39,17 @@ def require_light(model: SceneModel, values: Values, variables: Sequence[Variabl
     """Raise ValueError where the model sends far more or less light than images show, and no free power may make up for
     it: a calibration would take long to find that out."""
     powers = [v for v in variables if model.linear_in(v) and model.family(v.keys[0]) == "light"]
-    if model.captures.table is not None or not powers or any(v.prior is None for v in powers):
+    scales = [v for v in variables if model.linear_in(v) and v not in powers]
+    if model.captures.table is not None or not powers or any(v.prior is None for v in [*powers, *scales]):
         return
     scene, black = model.scene.values(), float(model.noise.black_level)
     frames = sorted(fitted, key=lambda i: -float(np.sum(model.frames[i].image[model.usable(i)])))[:BRIGHT]
     images = [model.frames[i].image[model.usable(i)] - black for i in frames]
     sent = [image[model.usable(i)] - black for i, image in zip(frames, model.predict(values, frames))]
     square = sum(float(np.sum(s**2)) for s in sent)
-    ratio = sum(float(np.sum(s * y)) for s, y in zip(sent, images)) / square if square else math.inf
+    ratio = sum(float(np.sum(s * y)) for s, y in zip(sent, images)) / square if square else math.nan
+    if not 0 < ratio < math.inf:  # nothing is usable, or the model sends nothing: what the fit says of that is clearer
+        return
     known = [v.prior for v in powers if v.prior is not None]
     beyond = min(abs(ratio - 1) * abs(value_of(model, values, v)) / prior[1] for v, prior in zip(powers, known))
     if 1 / DIM < ratio < DIM or not beyond > IMPOSSIBLE:
@@ -54,10 +58,10 @@ def require_light(model: SceneModel, values: Values, variables: Sequence[Variabl
     key = v.keys[0]
     raise ValueError(
         f"{model.captures.folder}: at its start the model sends {1 / ratio:.2g} times the light of the images, and "
-        f"what is known of the powers forbids to make up for it: {key} = {value_of(model, values, v):.4g} for "
+        f"what is known of the powers does not allow that: {key} = {value_of(model, values, v):.4g} for "
         f"{prior[0]:.4g} +- {prior[1]:.2g} (the scene has {scene[key]:.4g}). Allowed: {1 / DIM:g} to {DIM:g} times. "
-        f"Note in the frames the powers that the scene means, give another prior (--prior '{key}={prior[0] * ratio:.2g}"
-        f"+-{prior[1] * ratio:.2g}'), or correct the camera's exposure"
+        "If frames set powers, let them set those of the scene; or give another prior (--prior "
+        f"'{key}={prior[0] * ratio:.2g}+-{prior[1] * ratio:.2g}'), or correct the camera's exposure"
     )
 
 

@@ -68,6 +68,10 @@ def test_a_wrong_value_that_the_calibration_keeps_is_found(rig, tmp_path):
     study, model, fit = loop.begin(setup, tmp_path / "study")
     asked = {v.name for v in kept_values(model, SimpleNamespace(fit=fit, fitted=fit.frames))}
     assert {"gel.smoothing", "gel.indenter_size", "camera.x_fov", "camera.tilt"} < asked
+    exact = replace(model.captures, parameters={"gel.smoothing": 0.15})  # stated without an uncertainty
+    model.captures, kept = exact, model.captures
+    assert "gel.smoothing" not in {v.name for v in kept_values(model, SimpleNamespace(fit=fit, fitted=fit.frames))}
+    model.captures = kept
     # calibrated, set by frames, an effect's own, or asked about by an effect
     assert not asked & {"led_red.x", "led_red.power", "gel.press_x", "gel.coat", "camera.k1", "led_red.wavelength"}
     tested = ("exponential skirt", "lens blur", "gel bulge", "lens halo", *OFTEN)
@@ -76,7 +80,7 @@ def test_a_wrong_value_that_the_calibration_keeps_is_found(rig, tmp_path):
     assert found.word == "CANNOT_TELL"
     told = re.search(r"another value of gel.smoothing \((.*?) \+- (.*?) mm in place of 0.15\) explains", found.sentence)
     assert told and abs(float(told[1]) - 0.25) < 4 * float(told[2]) < 0.1, found.sentence
-    assert '[uncertainty] "gel.smoothing" = 0.05 mm' in found.hints[0]
+    assert '[uncertainty] "gel.smoothing" = 0.05, in mm;' in found.hints[0]
     file = tmp_path / "captures" / "captures.toml"
     said = '[parameters]\n"gel.smoothing" = 0.15\n\n[uncertainty]\n"gel.smoothing" = 0.05\n\n[[frames]]'
     file.write_text(file.read_text().replace("[[frames]]", said, 1))
