@@ -7,8 +7,8 @@ those that may explain as much as the best explanation are calibrated and held a
 (`optics.diagnosis.competition`).
 
 Not asked are values that captures state without an uncertainty, which are known; parameters of effects, which are asked
-anyway; and what changes no image. Nor are readings and images that are estimated by Monte Carlo, whose derivatives
-share the error of the prediction."""
+anyway; and what changes no image. Nothing is asked of readings of a table, nor of images that are estimated by Monte
+Carlo: their derivatives share the error of the prediction."""
 
 from __future__ import annotations
 

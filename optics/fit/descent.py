@@ -312,7 +312,7 @@ class Descent:
         best: tuple[np.ndarray, Values, Normal] | None = None
         gained, t = 0.0, min(2 * self.stride, 1.0)
         for _ in range(HALVINGS):
-            s, expected, length = t * u, GOOD * t * (2 - t) * promised, t
+            s, expected = t * u, GOOD * t * (2 - t) * promised
             for n in range(CORRECTIONS + 1):
                 found = there = self._at(self._stepped(s))
                 if self.powers and n == 0 and not self.here.total - found[2].total > expected:
@@ -323,7 +323,7 @@ class Descent:
                 if gain > expected or n == CORRECTIONS or not np.isfinite(there[2].total):
                     break
                 s = s + solve(a, there[2].b * self.slope - b + t * (a @ u), low - s, high - s)
-            if gained > expected or (best is not None and self.stride > length):
+            if gained > expected or (best is not None and self.stride > t):
                 break
             t /= 2
         if best is not None:
