@@ -102,6 +102,7 @@ SHOWN: dict[str, tuple[View, tuple[str, ...] | None]] = {
         View("gelsight", {"width": "240", "height": "180", "depth": "0.5", "radius": "1.5"}, SIDES),
         None,
     ),
+    "led-drift": (COLOURED, ("led_red",)),  # one light of three
     "led-size": (ONE_SIDE, None),  # one light: rims of shadows
     "height-fall-off": (ONE_SIDE, None),
     "specular-lobe": (ONE_SIDE, None),

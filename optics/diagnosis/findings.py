@@ -3,6 +3,7 @@ frames."""
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -290,7 +291,8 @@ def _ran(case: Case, fit: Fit) -> str:
 
 def _carried(case: Case, outcome: Outcome, subject: Candidate) -> tuple[float, str]:
     """(share, part) of the frame, the LED or the channel in which most of the fall lies by an effect that has a
-    strength per frame; (0, '') for other effects, and where there are fewer than three parts."""
+    strength per frame; (0, '') for other effects, and where there are fewer than three parts. Where each light has a
+    strength, that one light or its colour carries all is what the effect says: frames are asked about then."""
     if subject.effect.scope != "frame":
         return 0.0, ""
     model, evidence = case.model, case.evidence
@@ -306,10 +308,11 @@ def _carried(case: Case, outcome: Outcome, subject: Candidate) -> tuple[float, s
             by[kind][label] = by[kind].get(label, 0.0) + float(g.sum())
         for label, own in zip(prints.channel_names(evidence), g.sum((0, 1))):
             by["channel"][label] = by["channel"].get(label, 0.0) + float(own)
+    asked = by if subject.effect.per == "kind" else ("frame",)
     most = [
         (max(parts.values()), f"{kind} {max(parts, key=lambda k: parts[k])}")
         for kind, parts in by.items()
-        if len(parts) > 2
+        if len(parts) > 2 and kind in asked
     ]
     if not most or not total > 0:
         return 0.0, ""
@@ -326,14 +329,13 @@ def followed(
     if subject is None or subject.effect.scope != "frame":
         return None
     model, evidence = case.model, case.evidence
-    own = {
-        v.frames[0]: value_of(model, fit.values, v)
-        for v in fit.variables
-        if v.name in subject.row.variables and v.frames
-    }
+    series: dict[tuple[str, ...], dict[int, float]] = {}  # of each light apart, where each has a strength
+    for v in fit.variables:
+        if v.name in subject.row.variables and v.frames:
+            series.setdefault(v.keys, {})[v.frames[0]] = value_of(model, fit.values, v)
     turned = prints.settings(model, evidence)
     found: list[tuple[float, Fingerprint]] = []
-    for curve in fingerprints:
+    for curve, own in itertools.product(fingerprints, series.values()):
         if curve.net <= AS_GOOD * net:
             continue
         if curve.coordinate == "LED":

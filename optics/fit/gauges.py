@@ -194,10 +194,12 @@ def acting(model: Model, variables: Sequence[Variable]) -> list[Variable]:
 
     Left out are keys of films that are out of the beam in all frames, and keys that show through the changes of a
     setting (`Parameter.through`) that has one value in all frames: the wobble of a dial that never turned is a
-    transmittance, its scale an offset. Variables keep their names; one without a key left is dropped."""
+    transmittance, its scale an offset. So are gains of a light in frames that it does not light, and where no frame
+    has another light beside it: they are gains of whole frames then. Variables keep their names; one without a key left
+    is dropped."""
     found = []
     for v in variables:
-        keys = tuple(k for k in v.keys if _acts(model, k))
+        keys = tuple(k for k in v.keys if _acts(model, k) and _lights(model, k, v.frames))
         if keys:
             found.append(v if keys == v.keys else replace(v, keys=keys))
     return found
@@ -214,6 +216,19 @@ def _acts(model: Model, key: str) -> bool:
     own = f"{key.rpartition('.')[0]}.{through}"
     seen = [own] if own in parameters else keys_with(parameters, through)
     return any(len({float(x) for part in _set(model, k) for x in np.ravel(part)}) > 1 for k in seen)
+
+
+def _lights(model: Model, key: str, frames: Sequence[int] | None) -> bool:
+    """False of the gain of a light in frames (None: all) that it does not light, or that is alone in all its frames."""
+    parameters: Mapping[str, Parameter] = model.parameters
+    if parameters[key].role != "power gain":
+        return True
+    own, *_ = keys_with(
+        {k: p for k, p in parameters.items() if k.rpartition(".")[0] == key.rpartition(".")[0]}, "power"
+    )
+    lit = {k: [bool(np.any(x)) for x in _set(model, k)] for k in keys_with(parameters, "power")}
+    beside_others = any(on and sum(of[i] for of in lit.values()) > 1 for i, on in enumerate(lit[own]))
+    return beside_others and any(lit[own][i] for i in frames or range(len(lit[own])))
 
 
 def _set(model: Model, key: str) -> list:

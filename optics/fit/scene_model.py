@@ -260,9 +260,10 @@ class SceneModel:
 
     def linear_in(self, variable: Variable) -> bool:
         """Whether predictions are linear in a variable together with all others of which this holds: the LEDs'
-        powers, but for drive levels, which multiply them."""
+        powers, but for drive levels and gains, which multiply them."""
         drive = variable.frames is not None and not self.drives.isdisjoint(variable.keys)
-        return not drive and all(self._is_power(k) for k in variable.keys)
+        gains = self.scene.power_gains.values()
+        return not drive and all(self._is_power(k) and k not in gains for k in variable.keys)
 
     def _is_power(self, key: str) -> bool:
         return key in self.renderer.power_keys
@@ -658,9 +659,9 @@ class SceneModel:
         if self._is_power(key):
             if np.all(factor == 0):
                 return None
-            # the power is a product of four: the derivative by one of them is the product of the others
+            # the power is a product: the derivative by one factor is the product of the others
             others = self.renderer.powers({**now, key: 1.0}, name)
-            if key != self.scene.powers[name]:
+            if key in self.scene.band_powers[name]:
                 band = self.scene.band_powers[name].index(key)
                 others = np.where(self.renderer.colours == band, others, 0.0)
             factor = factor * others

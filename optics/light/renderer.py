@@ -1009,14 +1009,12 @@ class Renderer:
     def powers(self, values: Mapping, led: str) -> np.ndarray:
         """(B,) power of an LED in each band, relative to its image."""
         own = [values[key] for key in self.scene.band_powers[led]]
+        gain = self.scene.power_gains.get(led)
+        power = values[self.scene.powers[led]] * (1.0 if gain is None else values[gain])
         if self.integral is not None:
-            return (
-                values[self.scene.powers[led]] * np.array(own)[self.colours]
-                if own
-                else np.full(self.bands, values[self.scene.powers[led]])
-            )
+            return power * np.array(own)[self.colours] if own else np.full(self.bands, power)
         shares = own + [1.0] * self.bands
-        return values[self.scene.powers[led]] * np.array(shares[: self.bands])
+        return power * np.array(shares[: self.bands])
 
     def led_tangent_at_rest(self, values: Mapping, led: str, key: str, component: int = 0, seed: int = 0) -> np.ndarray:
         """`led_tangent`, kept: all frames share the gel at rest."""

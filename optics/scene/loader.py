@@ -104,7 +104,8 @@ class Scene:
     parameters   key -> Parameter, in the order of the file
     camera, integrator, gel, block, leds, membranes    the parts by role (None or empty where the scene has none)
     boards       carriers of LEDs, by id
-    powers, band_powers    the key of each light's power, and of its powers in single bands
+    powers, power_gains, band_powers    the key of each light's power, of its gain in single frames, and of its powers
+                                        in single bands
     """
 
     def __init__(
@@ -170,7 +171,7 @@ class Scene:
         for name, part in self.parts.items():
             for p in self.registry.parameters_of(part.kind):
                 self.parameters[f"{name}.{p.name}"] = p
-        self.powers, self.band_powers = self._light_powers()
+        self.powers, self.power_gains, self.band_powers = self._light_powers()
         with self._named():
             refuse_unseen(self)
         self._stock = self._stock_parameters()
@@ -237,15 +238,22 @@ class Scene:
         except BadScene as error:
             raise BadScene(f"{self.path}: {error}") from error
 
-    def _light_powers(self) -> tuple[dict[str, str], dict[str, list[str]]]:
-        """The key of each light's power; the keys of its powers in single bands, in the order of the bands."""
+    def _light_powers(self) -> tuple[dict[str, str], dict[str, str], dict[str, list[str]]]:
+        """The key of each light's power; of its gain in single frames, of lights that have one; the keys of its powers
+        in single bands, in the order of the bands."""
         own = {n: {k: p for k, p in self.parameters.items() if k.rpartition(".")[0] == n} for n in self.lights}
         bands = {n: sorted(keys_with(p, "band power"), key=lambda k: p[k].band or 0) for n, p in own.items()}
-        return {n: keys_with(p, "power")[0] for n, p in own.items()}, bands
+        gains = {n: keys[0] for n, p in own.items() if (keys := keys_with(p, "power gain"))}
+        return {n: keys_with(p, "power")[0] for n, p in own.items()}, gains, bands
 
     def power_keys(self, *lights: str) -> list[str]:
-        """The keys of all powers of some lights: of each light as a whole, then in single bands."""
-        return [key for n in lights for key in (self.powers[n], *self.band_powers[n])]
+        """The keys of all factors on the power of some lights: of each light as a whole, in single frames, then in
+        single bands."""
+        return [
+            key
+            for n in lights
+            for key in (self.powers[n], *filter(None, [self.power_gains.get(n)]), *self.band_powers[n])
+        ]
 
     def key(self, part: str, role: str) -> str | None:
         """The key of a part's parameter that has a role; None where it has none."""

@@ -19,6 +19,7 @@ LARGEST = 1e18  # of any number: squares of larger ones overflow in single preci
 FALL = 10.0  # a linearisation lowers a factor to no less than this part of it: at 0 it would hide everything else
 ROLES = {  # of parameters: what the library turns, sets or solves for, whatever a part calls it
     "power": "scales all light of a light; 0 switches it off",
+    "power gain": "scales all light of a light in single frames",
     "band power": "share of the power in one spectral band (`band`)",
     "light x": "where a point light stands, right, mm",
     "light y": "where a point light stands, down, mm",

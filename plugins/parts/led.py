@@ -5,14 +5,14 @@ Definition
     kappa_b = kappa w_b power_b prod(`emission` effects)         in the band b: irradiance across the beam, relative
     L_b = V T f_b(wi, s) cos(theta) kappa_b                      radiance that the lit point x sends to the camera (S5)
 with the distance d = |S - x| (mm) of the LED's position S from x, the unit vector s = (S - x)/d towards the LED, the
-axis p (so that a is the angle between axis and beam), the power eta = `power` and the lobe exponent mu (1 for a
-Lambertian chip, larger for a lens). V is 1 where the straight line to the LED is free and else 0, T what the gel's
-effects let pass, f the membrane's reflection, theta the angle between s and the skin's normal. w is the relative
-spectrum: a line of the given peak wavelength and full width at half maximum, or 1 in every band when `wavelength`
-is 0 (a white LED). power_b is `power_r`, `power_g`, `power_b` in the first three bands, 1 in a fourth: what an LED of
-unknown spectrum is calibrated by. They share a scale with `power` and, over all LEDs of a band, with the membrane's
-rho: hold one of them. With an emitting area A > 0 the source is a disc across the axis, of radius sqrt(A/pi): shadows
-get a penumbra.
+axis p (so that a is the angle between axis and beam), the power eta = `power` times `gain` (of single frames) and the
+lobe exponent mu (1 for a Lambertian chip, larger for a lens). V is 1 where the straight line to the LED is free and
+else 0, T what the gel's effects let pass, f the membrane's reflection, theta the angle between s and the skin's normal.
+w is the relative spectrum: a line of the given peak wavelength and full width at half maximum, or 1 in every band when
+`wavelength` is 0 (a white LED). power_b is `power_r`, `power_g`, `power_b` in the first three bands, 1 in a fourth:
+what an LED of unknown spectrum is calibrated by. They share a scale with `power` and, over all LEDs of a band, with the
+membrane's rho: hold one of them. With an emitting area A > 0 the source is a disc across the axis, of radius
+sqrt(A/pi): shadows get a penumbra.
 Fingerprint
     position and power shape the field of every frame in which the LED is lit; mu shows far from the axis.
 Validity
@@ -117,6 +117,17 @@ PARAMETERS = (
         role="power",
         free="all",
         prior_sd=0.3,  # the lambda term of S4: powers and reflectances are determined only as a product
+    ),
+    Parameter(
+        "gain",
+        "1",
+        1.0,
+        (0.0, 100.0),
+        "power of a frame relative to the others",
+        neutral=1.0,
+        plausible=0.02,
+        linear=True,
+        role="power gain",
     ),
     *(
         Parameter(
@@ -295,7 +306,7 @@ def build():
             """kappa of (S2), for a unit vector from the lit point to the LED and their distance in mm; a Float."""
             cos = dr.dot(-to_led, self.axis())
             lobe = dr.select(cos > 1e-4, dr.power(dr.maximum(cos, 1e-4), self.mu), 0.0)
-            return self.power * lobe / dr.square(distance)
+            return self.power * self.gain * lobe / dr.square(distance)
 
         def radiance(self, it, to_led, distance):
             """kappa of (S2) per band, with all that effects do to it."""

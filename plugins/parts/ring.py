@@ -4,8 +4,8 @@ Definition
     L_b = 1/n sum_k V_k T f_b(wi, s_k) cos(theta_k) kappa_b(S_k)    radiance that the lit point sends to the camera (S5)
     S_k = S + radius (cos(a_k) e1 + sin(a_k) e2),  a_k = 2 pi k/n + roll
     kappa_b = eta cos^mu / d^2 w_b power_b                          of the part `led` (S2)
-with the middle S of the circle, the axes e1 (side) and e2 (up) across the ring's axis and the power eta = `power` of
-all n LEDs together. All have the axis of the ring. The spectrum is that of the part `led`.
+with the middle S of the circle, the axes e1 (side) and e2 (up) across the ring's axis and the power eta =
+`power` times `gain` of all n LEDs together. All have the axis of the ring. The spectrum is that of the part `led`.
 Fingerprint
     shadows of n edges each, all around; the light varies little over the field.
 Validity

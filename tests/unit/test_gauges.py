@@ -1,6 +1,7 @@
 """Gauges: what no frame shows is found by its Gram matrix, named, and the combinations beside it are known."""
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -165,6 +166,23 @@ def test_dials_that_never_turned_and_films_on_the_table_are_not_freed():
     assert [v.name for v in gauges.acting(model, own("offset"))] == ["first.offset", "second.offset"]
     shared = Variable("film.wobble", tuple(f"{film}.wobble" for film in FILMS), WOBBLE)
     assert [(v.name, v.keys) for v in gauges.acting(model, [shared])] == [("film.wobble", ("second.wobble",))]
+
+
+def test_the_gain_of_a_light_shows_beside_another_light():
+    """Of frames with one light each it is the gain of the frame; a frame without the light does not show it."""
+    gain = Parameter("gain", "1", 1.0, (0.0, 100.0), neutral=1.0, role="power gain")
+    parameters = {f"{led}.{n}": p for led in "ab" for n, p in (("power", replace(POWER, role="power")), ("gain", gain))}
+    variables = [Variable(f"{led}.gain[{i}]", (f"{led}.gain",), gain, (i,)) for led in "ab" for i in range(3)]
+
+    def acting(*lit):
+        frames = [
+            Frame("f", np.zeros((1, 1, 1)), parameters={f"{led}.power": float(led in on) for led in "ab"}) for on in lit
+        ]
+        model = SimpleNamespace(parameters=parameters, base=dict.fromkeys(parameters, 1.0), frames=frames)
+        return [v.name for v in gauges.acting(model, variables)]
+
+    assert acting("a", "b", "a") == []
+    assert acting("ab", "b", "a") == ["a.gain[0]", "a.gain[2]", "b.gain[0]", "b.gain[1]"]
 
 
 def test_gains_that_change_together_are_told_without_their_factors():

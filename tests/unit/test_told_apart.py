@@ -432,7 +432,7 @@ def test_a_fall_of_what_is_known_lies_in_no_channel(monkeypatch, known, share):
     model, evidence = SimpleNamespace(frames=[frame]), SimpleNamespace(frames=[0])
     case = SimpleNamespace(model=model, evidence=evidence, known_chi2=lambda values: values)
     monkeypatch.setattr(findings.prints, "channel_names", lambda evidence: ["R", "G", "B"])
-    subject = SimpleNamespace(effect=SimpleNamespace(name="gain drift", scope="frame"))
+    subject = SimpleNamespace(effect=SimpleNamespace(name="gain drift", scope="frame", per="kind"))
     found, part = findings._carried(case, outcome, subject)
     assert found == pytest.approx(share, rel=0.01) and part == "channel R"
 

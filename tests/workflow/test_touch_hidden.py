@@ -59,6 +59,31 @@ def test_an_effect_hidden_in_a_sensor_is_named(rig, effect, tmp_path):
     assert after < 1.1 < before  # 2304 values: chi2 per value scatters by 3 %
 
 
+class Repeated(Small):
+    """More presses, for what each frame has by itself."""
+
+    held_out = ("press-02", "press-05")
+
+    def shots(self, scene, seed):
+        everything = Digit.shots(self, scene, seed)
+        return [*everything[:6], everything[-1]]
+
+
+@pytest.mark.parametrize("effect", ["LED drift", "gain drift"])
+def test_one_light_that_changes_is_told_from_all(effect, tmp_path):
+    """Each LED for itself, or all alike: the one has twice as many strengths more, and explains the other too."""
+    rig = Repeated()
+    rig.make(tmp_path / "captures", Cell(rig.name, "library", (effect,), 0.02, 0.0, "same", "", 1))
+    setup = rig.setup(tmp_path / "captures", 1)
+    study, model, fit = loop.begin(setup, tmp_path / "study")
+    tested = ("LED drift", *OFTEN, "camera gamma", "residual response curve")
+    without = [e.name for e in loop.candidates(model, study) if e.name not in tested]
+    found = loop.examine(study, model, setup, fit, advised=False, without=without)
+    assert found.word == "CLAIM" and found.missing == effect, found.sentence
+    before, after = (level.chi2_held_out for level in found.levels)
+    assert after < 1.1 < before
+
+
 def test_a_wrong_value_that_the_calibration_keeps_is_found(rig, tmp_path):
     """The scene says that the skin smooths a dent by 0.15 mm. Nothing is missing, but a skirt of the dent explains what
     that leaves, and would be claimed. With what is known stated as the verdict advises, nothing is left."""

@@ -45,6 +45,7 @@ MAKERS = (
     "gel absorption",
     "radial distortion",
     "gain drift",
+    "LED drift",
     "gel wedge",
     "gel bulge",
     "refraction at the window",
@@ -347,6 +348,12 @@ class Maker:
 
         return gaussian_filter(plane, FINE * np.sqrt(self.effects["lens blur"]), mode="nearest", truncate=6)
 
+    def together(self, light: Mapping[str, np.ndarray], drive: Mapping[str, float], frame: int) -> np.ndarray | float:
+        """The radiance of a frame's LEDs, each of which may drift by itself; 0 where none is lit."""
+        size, rng = self.effects.get("LED drift", 0.0), np.random.default_rng([self.seed, frame, 29])
+        drift = dict(zip(self.leds, 1 + size * rng.standard_normal(len(self.leds))))
+        return sum(p * drift[led] * self.values[f"{led}.power"] * light[led] for led, p in drive.items() if p)
+
     def through_gel(self, image: np.ndarray, led: str, press) -> np.ndarray:
         """Beer-Lambert and single scattering in numpy, on the analytic view of the dented plane (pixel centres)."""
         v = self.values
@@ -457,8 +464,7 @@ class Maker:
         for k, (press, light) in enumerate(zip(at, lights)):
             noted = press + known_to * rng.standard_normal(3) * (1, 1, 0.5)
             for drive in drives:
-                radiance = sum(p * self.values[f"{led}.power"] * light[led] for led, p in drive.items() if p)
-                radiance = radiance + light.get("ambient", 0.0)
+                radiance = self.together(light, drive, len(frames)) + light.get("ambient", 0.0)
                 if np.ndim(radiance) == 0:
                     radiance = np.zeros((*self.size[::-1], 3))
                 settings = {f"{led}.power": float(drive.get(led, 0.0)) for led in self.leds}

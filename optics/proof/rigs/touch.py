@@ -317,8 +317,8 @@ class Wild(Workshop, synthetic.Maker):
         with in_variant(synthetic.VARIANT):
             lights = [self.smeared(shot.press) for shot in shots]
         for number, (shot, light) in enumerate(zip(shots, lights)):
-            radiance = sum(p * self.values[f"{led}.power"] * light[led] for led, p in shot.drive.items() if p)
-            radiance = radiance + light.get("ambient", 0.0) + np.zeros((*self.size[::-1], 3))
+            radiance = self.together(light, shot.drive, number) + light.get("ambient", 0.0)
+            radiance = radiance + np.zeros((*self.size[::-1], 3))
             settings = {f"{led}.power": float(shot.drive.get(led, 0.0)) for led in self.leds}
             settings |= {f"{self.gel}.press_{n}": float(v) for n, v in zip(("x", "y", "depth"), shot.press)}
             settings[f"{self.camera}.exposure"] = float(self.values[f"{self.camera}.exposure"] * shot.exposure)
@@ -373,7 +373,7 @@ class Touch(ImageRig):
     )
     others = tuple(OTHER)
     unknown = UNKNOWN
-    random = ("gain drift",)
+    random = ("gain drift", "LED drift")
     width = height = 0
     exposure = 0.0
 
@@ -414,6 +414,7 @@ class Digit(Touch):
     frame; three of the presses are held out."""
 
     name = "digit"
+    effects = (*Touch.effects, "LED drift")
     pairs = pairs_of([e for e in Touch.effects if e not in ("interreflection", "gain drift")])
     width, height, exposure = 36, 48, 700.0
 
