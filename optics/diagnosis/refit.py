@@ -20,6 +20,7 @@ from optics.fit.model import Model, value_of
 from optics.fit.result import Fit
 from optics.scene.declare import Effect
 from optics.scene.parameter import Values, Variable
+from optics.words import percent, spaced
 
 START = 0.7  # of the expected change, to begin a refit from: the linear estimate overshoots more often than not
 LOW_START = 0.1  # of the expected change: a second start, for effects whose images bend
@@ -35,6 +36,7 @@ ROUGH = 0.5  # chi2 per variable at which a refit of a diagnosis, which compares
 # Of what a refit leaves beyond noise: a promised fall below it is not worth another linearisation. Where misfit is
 # left, falls that differ by less than a fifth decide nothing (`optics.diagnosis.thresholds.MARGIN`).
 COARSE = 0.01
+SEVERAL = 3  # lights whose changes from frame to frame are told
 FEW = 12  # iterations of a refit of images that continues one: it has been brought near
 FAILURES = (ValueError, ArithmeticError, np.linalg.LinAlgError)  # by which a refit says that it has no result
 
@@ -289,7 +291,10 @@ def write(case: Case, c: Candidate, best: Attempt, predicted: float) -> None:
 
 
 def known_of(found: Fit, c: Candidate) -> str:
-    """What is known of strengths of which a gauge leaves only combinations, in words; '' where each is known."""
+    """What is known of strengths of which a gauge leaves only combinations, or of which each frame has one, in words;
+    '' where each is known."""
+    if c.effect.scope == "frame":
+        return _from_frame_to_frame(found, c)
     names = [v.name for v in found.variables]
     if not all(v.name in names for v in c.variables):
         return ""
@@ -297,6 +302,25 @@ def known_of(found: Fit, c: Candidate) -> str:
     covariance = np.asarray(found.covariance, float)[np.ix_(own, own)]
     text = gauges.strengths_told(covariance, c.variables, [float(found.estimate[i]) for i in own])
     return text if "not show" in text else ""
+
+
+def _from_frame_to_frame(found: Fit, c: Candidate) -> str:
+    """'1.9 % (rms from frame to frame)' of strengths that each frame has for itself, or of each part that has them:
+    'led_red 1.9 %, led_blue 0.1 % (rms from frame to frame)', the largest first."""
+    series: dict[tuple[str, ...], list[float]] = {}
+    for v, estimate in zip(found.variables, found.estimate):
+        if any(v.name == own.name for own in c.variables):
+            series.setdefault(v.keys, []).append(float(estimate))
+    p = c.variables[0].parameter
+
+    def told(values: Sequence[float]) -> str:
+        rms = float(np.std(values))
+        return percent(rms / p.neutral, 2) if p.neutral and p.unit == "1" else f"{rms:.2g}{spaced(p.unit)}"
+
+    ranked = sorted(series.items(), key=lambda item: -np.std(item[1]))
+    texts = [f"{keys[0].rpartition('.')[0]} {told(values)}" for keys, values in ranked]
+    text = ", ".join(texts[:SEVERAL]) + (f" and {len(texts) - SEVERAL} more less" if len(texts) > SEVERAL else "")
+    return f"{told(ranked[0][1]) if len(ranked) == 1 else text} (rms from frame to frame)" if ranked else ""
 
 
 def clear(found: Fit, c: Candidate, strength: Sequence[float]) -> float:

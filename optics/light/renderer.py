@@ -18,7 +18,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import repeat
 from types import SimpleNamespace
 
@@ -26,6 +26,7 @@ import numpy as np
 
 from optics.errors import Apart, BadScene
 from optics.light import paths
+from optics.light.moving_shadows import turned
 from optics.light.samples import Finer, Hits, LedImage, Sample, Traced, aligned, around, creases, edges
 from optics.light.together import Group, alike, numbers_of
 from optics.processes import return_memory
@@ -1154,7 +1155,35 @@ class Renderer:
                     sides.append(self._shade(sample, lights(given), self._visible(sample.si, lights(given))))
             return (sides[0] - sides[1]) / (2 * step)
 
+        straight = bool(moving) and not self.crowded and not lamp.places()
+
+        def speed(key, of):
+            """How far the light moves per unit of a parameter, mm."""
+            value = mi.Float(dr.detach(value_of(key)))
+            dr.enable_grad(value)
+            with put({key: value}) as given:
+                at = of()[1](given).position()
+            dr.set_grad(value, 1.0)
+            return dr.forward_to(at, flags=dr.ADFlag.ClearVertices | dr.ADFlag.AllowNoGrad)
+
+        @cache
+        def shadows(of):
+            sample, lights = of()
+            return turned(self.scene.integrator, self._world(), sample.si, lights({}))
+
+        def shaded_and_moved(of, visible):
+            """Of a point light: how what it lights changes, and what its shadows take where they move."""
+            found = dict(zip(keys, tangents(of, visible, keys)))
+            sample, lights = of()
+            lit, unlit = (self._shade(sample, lights({}), mi.Mask(seen)) for seen in (True, False))
+            for key in moving:
+                v = speed(key, of)
+                found[key] += (lit - unlit) * sum(dr.dot(v, side) * rate for side, rate in shadows(of))
+            return [found[k] for k in keys]
+
         def rims(of, visible):
+            if straight:
+                return shaded_and_moved(of, visible)
             still = [k for k in keys if k not in moving]
             found = dict(zip(still, tangents(of, visible, still))) if still else {}
             return [found[k] if k in found else moved(k, of) for k in keys]

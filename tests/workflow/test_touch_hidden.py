@@ -80,6 +80,10 @@ def test_one_light_that_changes_is_told_from_all(effect, tmp_path):
     without = [e.name for e in loop.candidates(model, study) if e.name not in tested]
     found = loop.examine(study, model, setup, fit, advised=False, without=without)
     assert found.word == "CLAIM" and found.missing == effect, found.sentence
+    told = re.findall(r"(led_\w+ )?(\d\.\d+) %", found.sentence.split("(rms from frame to frame)")[0])
+    assert len(told) == (3 if effect == "LED drift" else 1)
+    for _, size in told:  # of four frames: the standard deviation of 2 % scatters by a third
+        assert 0.5 < float(size) < 4
     before, after = (level.chi2_held_out for level in found.levels)
     assert after < 1.1 < before
 
