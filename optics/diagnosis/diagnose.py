@@ -35,7 +35,7 @@ from optics.diagnosis.explanations import Outcome
 from optics.diagnosis.findings import basis_of, findings_of, followed, subject_of
 from optics.diagnosis.fixed_values import FixedValue, best_of_fixed
 from optics.diagnosis.laws import other_laws
-from optics.diagnosis.refit import COARSE, Case, Cooled, Expected, after_at, refit_each
+from optics.diagnosis.refit import COARSE, Case, Cooled, Expected, after_at, refit_each, swings
 from optics.diagnosis.result import (
     NAMED,
     Basis,
@@ -51,7 +51,7 @@ from optics.diagnosis.result import (
 )
 from optics.diagnosis.score import Scored, score
 from optics.diagnosis.text import leaves_misfit, sentence
-from optics.diagnosis.thresholds import AS_GOOD, CLEAR, EXCESS, LEVEL, MARGIN, MAX_SPLIT, SHARE, close
+from optics.diagnosis.thresholds import AS_GOOD, CLEAR, EXCESS, LEVEL, MARGIN, MAX_SPLIT, SHARE, SWINGING, close
 from optics.errors import Underdetermined
 from optics.fit import calibrate
 from optics.fit.model import Model
@@ -159,7 +159,7 @@ def _diagnosed(request: Request) -> Diagnosis:
     chosen = _choose(case, request.top, request.asked)
     due = {name for e in case.expected if len(e.names) == 1 for name in e.names} - {c.effect.name for c in chosen}
     chosen += [c for c in case.table.order if c.effect.name in due]
-    fits = refit_each(case, chosen)
+    chosen, fits = _without_wild_lights(case, chosen, refit_each(case, chosen), scored.not_tested)
     if request.cooler is not None and (cooled := request.cooler(_best_first(case, fits))):
         cooler = replace(request, fit=cooled.base, refit=cooled.refit, foresee=cooled.foresee, cooler=None, asked=fits)
         try:
@@ -328,6 +328,23 @@ def _written(
         fits=fits,
         evidence=replace(evidence, blocks=[], sigma=[], whitened=[], use=[], candidates=table.order),
     )
+
+
+def _without_wild_lights(
+    case: Case, chosen: list[Candidate], fits: dict[str, Fit], not_tested: dict[str, str]
+) -> tuple[list[Candidate], dict[str, Fit]]:
+    """Leave out effects by which a light would change from frame to frame by more than lights do (SWINGING): gains of
+    every light in every frame follow whatever is wrong with how these light the skin, in any company."""
+    wild = {
+        c.effect.name: times
+        for c in chosen
+        if c.effect.name in fits and (times := swings(fits[c.effect.name], c)) > SWINGING
+    }
+    for name, times in wild.items():
+        not_tested[name] = f"a light would change by {times:.2g} times what is plausible; {SWINGING:g} allowed"
+    case.table.order[:] = [c for c in case.table.order if c.effect.name not in wild]
+    kept = {name: found for name, found in fits.items() if name not in wild}
+    return [c for c in chosen if c.effect.name not in wild], kept
 
 
 def _without_followers(

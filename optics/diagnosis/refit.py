@@ -304,23 +304,36 @@ def known_of(found: Fit, c: Candidate) -> str:
     return text if "not show" in text else ""
 
 
-def _from_frame_to_frame(found: Fit, c: Candidate) -> str:
-    """'1.9 % (rms from frame to frame)' of strengths that each frame has for itself, or of each part that has them:
-    'led_red 1.9 %, led_blue 0.1 % (rms from frame to frame)', the largest first."""
+def _series(found: Fit, c: Candidate) -> dict[tuple[str, ...], list[float]]:
+    """The strengths of single frames, of each parameter."""
     series: dict[tuple[str, ...], list[float]] = {}
     for v, estimate in zip(found.variables, found.estimate):
         if any(v.name == own.name for own in c.variables):
             series.setdefault(v.keys, []).append(float(estimate))
+    return series
+
+
+def _from_frame_to_frame(found: Fit, c: Candidate) -> str:
+    """'1.9 % (rms from frame to frame)' of strengths that each frame has for itself, or of each part that has them:
+    'led_red 1.9 %, led_blue 0.1 % (rms from frame to frame)', the largest first."""
     p = c.variables[0].parameter
 
     def told(values: Sequence[float]) -> str:
         rms = float(np.std(values))
         return percent(rms / p.neutral, 2) if p.neutral and p.unit == "1" else f"{rms:.2g}{spaced(p.unit)}"
 
-    ranked = sorted(series.items(), key=lambda item: -np.std(item[1]))
+    ranked = sorted(_series(found, c).items(), key=lambda item: -np.std(item[1]))
     texts = [f"{keys[0].rpartition('.')[0]} {told(values)}" for keys, values in ranked]
     text = ", ".join(texts[:SEVERAL]) + (f" and {len(texts) - SEVERAL} more less" if len(texts) > SEVERAL else "")
     return f"{told(ranked[0][1]) if len(ranked) == 1 else text} (rms from frame to frame)" if ranked else ""
+
+
+def swings(found: Fit, c: Candidate) -> float:
+    """Of strengths that each frame has for each part, how much those of one part vary, in plausible sizes: the largest
+    standard deviation. 0 for other effects."""
+    if c.effect.scope != "frame" or c.effect.per == "kind":
+        return 0.0
+    return max((float(np.std(values)) for values in _series(found, c).values()), default=0.0) / float(c.plausible[0])
 
 
 def clear(found: Fit, c: Candidate, strength: Sequence[float]) -> float:

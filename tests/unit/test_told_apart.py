@@ -28,7 +28,7 @@ from optics.diagnosis.session import Frames
 from optics.diagnosis.thresholds import TOLD
 from optics.fit.scene_model import SceneModel
 from optics.scene import registry
-from optics.scene.parameter import Values
+from optics.scene.parameter import Parameter, Values, Variable
 
 
 def form(name, information, fall):
@@ -807,3 +807,23 @@ def test_a_detail_of_what_is_not_decided_is_no_claim(falls, core, found):
     trials = [SimpleNamespace(names=frozenset(names), fall=fall) for names, fall in [*falls.items(), ("", 0.0)]]
     outcome = SimpleNamespace(best=trials[0], core=list(core), trials=trials)
     assert findings._detail_of(outcome, "b") == found
+
+
+@pytest.mark.parametrize("change, left", [(0.03, ["LED drift", "gamma"]), (0.2, ["gamma"])])
+def test_lights_that_would_change_more_than_lights_do_explain_nothing(change, left):
+    """Gains of each light in each frame follow whatever is wrong with how lights light the skin: not by a fifth."""
+    gain = Parameter("gain", "1", 1.0, (0.0, 100.0), neutral=1.0, plausible=0.02)
+    lights = {"a": [1 + change, 1 - change, 1 + change], "b": [1.0, 1.001, 0.999]}
+    variables = [Variable(f"{n}.gain[{i}]", (f"{n}.gain",), gain, (i,)) for n in lights for i in range(3)]
+    drift = SimpleNamespace(
+        effect=SimpleNamespace(name="LED drift", scope="frame", per="part"),
+        variables=variables,
+        plausible=np.full(6, 0.02),
+    )
+    gamma = SimpleNamespace(effect=SimpleNamespace(name="gamma", scope="common", per="kind"), variables=[])
+    found = SimpleNamespace(variables=variables, estimate=[x for own in lights.values() for x in own])
+    case, not_tested = SimpleNamespace(table=SimpleNamespace(order=[drift, gamma])), {}
+    chosen, fits = diagnose._without_wild_lights(case, [drift, gamma], {"LED drift": found, "gamma": None}, not_tested)
+    assert [c.effect.name for c in chosen] == list(fits) == [c.effect.name for c in case.table.order] == left
+    assert list(not_tested) == [n for n in ("LED drift", "gamma") if n not in left]
+    assert refit.known_of(found, drift) == f"a {100 * np.std(lights['a']):.2g} %, b 0.082 % (rms from frame to frame)"
