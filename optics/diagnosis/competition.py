@@ -34,7 +34,7 @@ from optics.diagnosis import statistics as st
 from optics.diagnosis.correlation import Correlation
 from optics.diagnosis.evidence import Candidate
 from optics.diagnosis.explanations import ALIKE, Outcome, Trial, distance, scale_of, worth
-from optics.diagnosis.refit import Case
+from optics.diagnosis.refit import Case, swings
 from optics.diagnosis.shared_noise import (
     bound_wander,
     derivatives_of,
@@ -45,7 +45,7 @@ from optics.diagnosis.shared_noise import (
     readings_about,
     wander_of,
 )
-from optics.diagnosis.thresholds import CLEAR, HALF, LEVEL, MARGIN, MISSTATED, NO_TIE, SURE, TOLD
+from optics.diagnosis.thresholds import CLEAR, HALF, LEVEL, MARGIN, MISSTATED, NO_TIE, SURE, SWINGING, TOLD
 from optics.fit.model import value_of
 
 NEAR = 6  # explanations, the best in score, that must predict blocks that were left out
@@ -57,6 +57,8 @@ LOOSE = 10.0  # plausible sizes: what keeps a strength that a left-out block alo
 
 def compete(case: Case, trials: list[Trial]) -> Outcome:
     """The explanations that are not told apart from the best."""
+    if not case.evidence.is_table:
+        trials = [t for t in trials if not any(swings(t.fit, c) > SWINGING for c in t.members)]
     scale, correlation = scale_of(case, trials), Correlation()
     order = sorted(trials, key=lambda t: -worth(t, scale))
     for t in order:

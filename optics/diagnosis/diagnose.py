@@ -342,7 +342,7 @@ def _without_wild_lights(
     }
     for name, times in wild.items():
         not_tested[name] = f"a light would change by {times:.2g} times what is plausible; {SWINGING:g} allowed"
-    case.table.order[:] = [c for c in case.table.order if c.effect.name not in wild]
+    case.table.leave_out(wild)
     kept = {name: found for name, found in fits.items() if name not in wild}
     return [c for c in chosen if c.effect.name not in wild], kept
 

@@ -304,13 +304,30 @@ def known_of(found: Fit, c: Candidate) -> str:
     return text if "not show" in text else ""
 
 
-def _series(found: Fit, c: Candidate) -> dict[tuple[str, ...], list[float]]:
-    """The strengths of single frames, of each parameter."""
-    series: dict[tuple[str, ...], list[float]] = {}
-    for v, estimate in zip(found.variables, found.estimate):
+def _swings_of(found: Fit, c: Candidate) -> dict[tuple[str, ...], float]:
+    """How much the strengths of single frames vary, of each parameter (`_spread`)."""
+    places: dict[tuple[str, ...], list[int]] = {}
+    for i, v in enumerate(found.variables):
         if any(v.name == own.name for own in c.variables):
-            series.setdefault(v.keys, []).append(float(estimate))
-    return series
+            places.setdefault(v.keys, []).append(i)
+    x, covariance = np.asarray(found.estimate, float), np.asarray(found.covariance, float)
+    return {keys: _spread(x[own], covariance[np.ix_(own, own)]) for keys, own in places.items()}
+
+
+def _spread(x: np.ndarray, covariance: np.ndarray) -> float:
+    """Standard deviation of values about their mean, less what their errors make of it: those of a dim light scatter.
+    An error that all share, as of a scale, is none of it. Each value counts by its weight."""
+    known = np.isfinite(np.diag(covariance)) & (np.diag(covariance) > 0)
+    x, covariance = x[known], covariance[np.ix_(known, known)]
+    if len(x) < 2:
+        return 0.0
+    weight = np.full(len(x), 1 / len(x))
+    for _ in range(2):  # of the plain mean, then by weights
+        about = np.eye(len(x)) - weight
+        expected = np.maximum(np.diag(about @ covariance @ about.T), 1e-30)
+        moved = about @ x
+        weight = (1 / expected) / (1 / expected).sum()
+    return math.sqrt(max(float(weight @ (moved**2 - expected)), 0.0))
 
 
 def _from_frame_to_frame(found: Fit, c: Candidate) -> str:
@@ -318,14 +335,13 @@ def _from_frame_to_frame(found: Fit, c: Candidate) -> str:
     'led_red 1.9 %, led_blue 0.1 % (rms from frame to frame)', the largest first."""
     p = c.variables[0].parameter
 
-    def told(values: Sequence[float]) -> str:
-        rms = float(np.std(values))
+    def told(rms: float) -> str:
         return percent(rms / p.neutral, 2) if p.neutral and p.unit == "1" else f"{rms:.2g}{spaced(p.unit)}"
 
-    ranked = sorted(_series(found, c).items(), key=lambda item: -np.std(item[1]))
-    texts = [f"{keys[0].rpartition('.')[0]} {told(values)}" for keys, values in ranked]
+    ranked = sorted(((rms, keys) for keys, rms in _swings_of(found, c).items()), reverse=True)
+    texts = [f"{keys[0].rpartition('.')[0]} {told(rms)}" for rms, keys in ranked]
     text = ", ".join(texts[:SEVERAL]) + (f" and {len(texts) - SEVERAL} more less" if len(texts) > SEVERAL else "")
-    return f"{told(ranked[0][1]) if len(ranked) == 1 else text} (rms from frame to frame)" if ranked else ""
+    return f"{told(ranked[0][0]) if len(ranked) == 1 else text} (rms from frame to frame)" if ranked else ""
 
 
 def swings(found: Fit, c: Candidate) -> float:
@@ -333,7 +349,7 @@ def swings(found: Fit, c: Candidate) -> float:
     standard deviation. 0 for other effects."""
     if c.effect.scope != "frame" or c.effect.per == "kind":
         return 0.0
-    return max((float(np.std(values)) for values in _series(found, c).values()), default=0.0) / float(c.plausible[0])
+    return max(_swings_of(found, c).values(), default=0.0) / float(c.plausible[0])
 
 
 def clear(found: Fit, c: Candidate, strength: Sequence[float]) -> float:

@@ -243,7 +243,7 @@ def lamp_text(case: Case, outcome: Outcome, basis: Basis) -> str:
     share = best.gain * outcome.scale / max(basis.chi2 - basis.dof, 1.0)
     if not share > SWUNG:
         return ""
-    names = [c.effect.name for c in case.table.order if c.effect.scope == "frame"]
+    names = [c.effect.name for c in case.table.order if c.effect.scope == "frame" and c.effect.per == "kind"]
     more = f" If no lamp did that, add {some(names)} and diagnose again." if names else ""
     swing = percent(wander_of(case, outcome, best))
     frames = "Besides, whole frames" if best.members else "Whole frames"

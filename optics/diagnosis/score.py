@@ -202,6 +202,13 @@ class Table:
     uniform: dict[str, float]
     dilated: dict[str, float]
 
+    def leave_out(self, names: Collection[str]) -> None:
+        """Without these effects from here on."""
+        self.order = [c for c in self.order if c.effect.name not in names]
+        self.uniform, self.dilated = (
+            {name: net for name, net in nets.items() if name not in names} for nets in (self.uniform, self.dilated)
+        )
+
     @property
     def preferred(self) -> dict[str, str]:
         """In words, other weights -> the best effect by them; '' for none."""

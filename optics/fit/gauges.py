@@ -198,8 +198,9 @@ def acting(model: Model, variables: Sequence[Variable]) -> list[Variable]:
     has another light beside it: they are gains of whole frames then. Variables keep their names; one without a key left
     is dropped."""
     found = []
+    lit = _lit(model) if any(v.parameter.role == "power gain" for v in variables) else {}
     for v in variables:
-        keys = tuple(k for k in v.keys if _acts(model, k) and _lights(model, k, v.frames))
+        keys = tuple(k for k in v.keys if _acts(model, k) and _shows(model, k, v.frames, lit))
         if keys:
             found.append(v if keys == v.keys else replace(v, keys=keys))
     return found
@@ -218,17 +219,21 @@ def _acts(model: Model, key: str) -> bool:
     return any(len({float(x) for part in _set(model, k) for x in np.ravel(part)}) > 1 for k in seen)
 
 
-def _lights(model: Model, key: str, frames: Sequence[int] | None) -> bool:
+def _lit(model: Model) -> dict[str, list[bool]]:
+    """Part -> whether it sends light in each frame, of what has a power."""
+    return {
+        key.rpartition(".")[0]: [bool(np.any(x)) for x in _set(model, key)]
+        for key in keys_with(model.parameters, "power")
+    }
+
+
+def _shows(model: Model, key: str, frames: Sequence[int] | None, lit: Mapping[str, Sequence[bool]]) -> bool:
     """False of the gain of a light in frames (None: all) that it does not light, or that is alone in all its frames."""
-    parameters: Mapping[str, Parameter] = model.parameters
-    if parameters[key].role != "power gain":
+    if model.parameters[key].role != "power gain":
         return True
-    own, *_ = keys_with(
-        {k: p for k, p in parameters.items() if k.rpartition(".")[0] == key.rpartition(".")[0]}, "power"
-    )
-    lit = {k: [bool(np.any(x)) for x in _set(model, k)] for k in keys_with(parameters, "power")}
-    beside_others = any(on and sum(of[i] for of in lit.values()) > 1 for i, on in enumerate(lit[own]))
-    return beside_others and any(lit[own][i] for i in frames or range(len(lit[own])))
+    own = lit[key.rpartition(".")[0]]
+    beside_others = any(on and sum(other[i] for other in lit.values()) > 1 for i, on in enumerate(own))
+    return beside_others and any(own[i] for i in frames or range(len(own)))
 
 
 def _set(model: Model, key: str) -> list:

@@ -53,6 +53,7 @@ from optics.study.setup import (
     open_model,
     recorded,
     split,
+    steady,
     variables_of_base,
 )
 from optics.study.shown import fingerprints_of, mosaic_of, shown_frames
@@ -263,8 +264,7 @@ def excluded(model: SceneModel, record: Record | None, without: Sequence[str] = 
     registry, captures = model.scene.registry, model.captures
     dropped = {registry.find_effect(name).key for name in without}
     ruled_out = {key_of(name): reason for name, reason in captures.exclude.items()}
-    stated = capture_files.stated(captures)
-    doubted = {*captures.uncertainty, *(key for f in model.frames for key in f.uncertainty)}
+    stated = steady(model)
     drawn = _drawn_from(model, _expressible(model, record))
     found = {}
     for effect in _expressible(model, record):
@@ -276,13 +276,13 @@ def excluded(model: SceneModel, record: Record | None, without: Sequence[str] = 
             found[effect.name] = f"absent: {', '.join(missing)}"
         elif effect.key in drawn:
             found[effect.name] = "drafted from these captures: it fits them by construction; test it on others"
-        elif not effect_variables(model, effect):
-            found[effect.name] = f"no frame can show it; it needs {effect.needs}"
-        elif effect.scope == "frame":
+        else:
             keys = [key for keys in model.scene.keys_of(effect).values() for key in keys]
-            fixed = [key for key in keys if key in stated and key not in doubted]
-            if fixed:
+            fixed = [key for key in keys if key in stated] if effect.scope == "frame" else []
+            if fixed and (effect.per == "kind" or len(fixed) == len(keys)):
                 found[effect.name] = f"stated: {fixed[0]} = {stated[fixed[0]]:g} in every frame"
+            elif not effect_variables(model, effect):
+                found[effect.name] = f"no frame can show it; it needs {effect.needs}"
     return found
 
 

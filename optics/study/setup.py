@@ -402,9 +402,11 @@ def effect_variables(model: SceneModel, effect: Effect, held: Sequence[Variable]
 
     Of several strengths a common mode may be degenerate, such as a gain that all frames share. A prior of GAUGE
     plausible sizes holds it at the scene's value, and data that determine it outweigh the prior. Parts that are absent
-    have no part in it.
+    have no part in it, nor has one of several parts of which captures state that it stays the same in all frames.
     """
     taken = {key for v in held for key in v.keys}
+    if effect.scope == "frame" and effect.per != "kind":
+        taken |= {*steady(model)}
     present = []
     for v in model.scene.variables_of(effect, len(model.frames)):
         keys = tuple(k for k in v.keys if k.rpartition(".")[0] not in model.captures.absent)
@@ -414,6 +416,12 @@ def effect_variables(model: SceneModel, effect: Effect, held: Sequence[Variable]
     if len(found) < 2:
         return found
     return [_with_prior(model, v, "*", (None, GAUGE * v.parameter.plausible)) for v in found]
+
+
+def steady(model: SceneModel) -> dict[str, float | str]:
+    """What every frame has with one value because the captures say so, and without an uncertainty."""
+    doubted = {*model.captures.uncertainty, *(key for f in model.frames for key in f.uncertainty)}
+    return {key: value for key, value in capture_files.stated(model.captures).items() if key not in doubted}
 
 
 def _untouched(model: SceneModel, frames: Sequence[int]) -> bool:

@@ -306,7 +306,8 @@ def build():
             """kappa of (S2), for a unit vector from the lit point to the LED and their distance in mm; a Float."""
             cos = dr.dot(-to_led, self.axis())
             lobe = dr.select(cos > 1e-4, dr.power(dr.maximum(cos, 1e-4), self.mu), 0.0)
-            return self.power * self.gain * lobe / dr.square(distance)
+            gain = self.gain if "gain" in self.numbers else 1.0  # which a light of one's own may lack
+            return self.power * gain * lobe / dr.square(distance)
 
         def radiance(self, it, to_led, distance):
             """kappa of (S2) per band, with all that effects do to it."""

@@ -4,11 +4,11 @@ Definition
     L_b = 1/A int_A V T f_b(wi, s) cos(theta) kappa_b dA          radiance that the lit point x sends to the camera (S5)
     kappa_b = eta cos(a)^mu / d^2 w_b power_b                     1/mm^2; 0 where cos(a) <= 0, see the part `led` (S2)
 over the area A = length width of the rectangle, with the distance d of its point S from x, the unit vector s from x
-towards S, the angle a between the beam and the axis p, the power eta = `power`, the visibility V, the transmittance T
-of the gel, the membrane's reflection f and the angle theta between s and the skin's normal. At mu = 1 each point is
-Lambertian and the rectangle has the radiance eta/A: without shadows it gives the irradiance pi eta/A F, F the view
-factor of a polygon (Lambert). The rectangle lies across the nominal axis, its long side along `along`, turned by
-`roll`; `pan` and `tilt` turn the lobe alone.
+towards S, the angle a between the beam and the axis p, the power eta = `power` times `gain`, the visibility V, the
+transmittance T of the gel, the membrane's reflection f and the angle theta between s and the skin's normal. At mu = 1
+each point is Lambertian and the rectangle has the radiance eta/A: without shadows it gives the irradiance pi eta/A F, F
+the view factor of a polygon (Lambert). The rectangle lies across the nominal axis, its long side along `along`, turned
+by `roll`; `pan` and `tilt` turn the lobe alone.
     S_k: n points that stand for A/n each;  n = 4 ceil((length + width)/(2 mm)), at least 16, of the XML's sizes
 Along the strip they are Gauss-Legendre points, two in each of n/4 cells. Across it each has another place, and its
 mirror image: the edge of a shadow crosses them one by one, or in pairs.

@@ -409,7 +409,7 @@ def test_a_refit_from_the_end_of_another_must_explain_more_than_was_known(monkey
 def test_a_lamp_may_swing_where_a_gain_of_each_frame_may_be_missing(scopes, complete, most):
     """Where captures state one exposure for all frames, or effects leave nothing, a swing that anybody notices is no
     noise."""
-    order = [SimpleNamespace(effect=SimpleNamespace(scope=scope)) for scope in scopes]
+    order = [SimpleNamespace(effect=SimpleNamespace(scope=scope, per="kind")) for scope in scopes]
     case = SimpleNamespace(
         evidence=SimpleNamespace(is_table=False), table=SimpleNamespace(order=order), lamp=SimpleNamespace(most=0.0)
     )
@@ -760,7 +760,7 @@ def test_a_lamp_that_takes_much_of_the_misfit_is_mentioned(monkeypatch, gain, by
     misfit, and the verdict spoke of another effect alone."""
     monkeypatch.setattr(remarks, "wander_of", lambda case, outcome, trial: 0.0104)
     scopes = {"gain drift": "frame", "gel bulge": "common"}
-    order = [SimpleNamespace(effect=SimpleNamespace(name=n, scope=s)) for n, s in scopes.items()]
+    order = [SimpleNamespace(effect=SimpleNamespace(name=n, scope=s, per="kind")) for n, s in scopes.items()]
     case = SimpleNamespace(evidence=SimpleNamespace(is_table=False), lamp=object(), table=SimpleNamespace(order=order))
     best = SimpleNamespace(by_frame=by_frame, members=[order[1]], gain=gain)
     text = remarks.lamp_text(
@@ -819,11 +819,26 @@ def test_lights_that_would_change_more_than_lights_do_explain_nothing(change, le
         effect=SimpleNamespace(name="LED drift", scope="frame", per="part"),
         variables=variables,
         plausible=np.full(6, 0.02),
+        contains=lambda other: False,
+        row=SimpleNamespace(refit=None, net=3.0),
     )
-    gamma = SimpleNamespace(effect=SimpleNamespace(name="gamma", scope="common", per="kind"), variables=[])
+    gamma = SimpleNamespace(
+        effect=SimpleNamespace(name="gamma", scope="common", per="kind"),
+        variables=[],
+        contains=lambda other: False,
+        row=SimpleNamespace(refit=None, net=1.0),
+    )
     found = SimpleNamespace(variables=variables, estimate=[x for own in lights.values() for x in own])
-    case, not_tested = SimpleNamespace(table=SimpleNamespace(order=[drift, gamma])), {}
+    found.covariance = np.diag([0.0005**2] * 6) + 0.2**2  # they share a scale that nobody knows
+    nets = {"LED drift": 3.0, "gamma": 1.0}
+    table = score.Table([drift, gamma], np.eye(7), None, 0.0, nets, nets)
+    case, not_tested = SimpleNamespace(table=table), {}
     chosen, fits = diagnose._without_wild_lights(case, [drift, gamma], {"LED drift": found, "gamma": None}, not_tested)
     assert [c.effect.name for c in chosen] == list(fits) == [c.effect.name for c in case.table.order] == left
     assert list(not_tested) == [n for n in ("LED drift", "gamma") if n not in left]
-    assert refit.known_of(found, drift) == f"a {100 * np.std(lights['a']):.2g} %, b 0.082 % (rms from frame to frame)"
+    assert list(table.uniform) == list(table.dilated) == left and table.fragile("gamma") == ""
+    told = refit.known_of(found, drift)
+    assert told == f"a {100 * np.std(lights['a']):.2g} %, b 0.071 % (rms from frame to frame)"
+    found.covariance = np.diag([0.001**2] * 3 + [0.1**2] * 3)  # a dim light, whose gains scatter by their errors
+    found.estimate = [*lights["a"], 1.08, 0.96, 0.93]
+    assert refit.known_of(found, drift).endswith("b 0 % (rms from frame to frame)")
