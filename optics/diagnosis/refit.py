@@ -36,6 +36,7 @@ ROUGH = 0.5  # chi2 per variable at which a refit of a diagnosis, which compares
 # Of what a refit leaves beyond noise: a promised fall below it is not worth another linearisation. Where misfit is
 # left, falls that differ by less than a fifth decide nothing (`optics.diagnosis.thresholds.MARGIN`).
 COARSE = 0.01
+TINY = 1e-12  # of gains and of squares of their changes
 SEVERAL = 3  # lights whose changes from frame to frame are told
 FEW = 12  # iterations of a refit of images that continues one: it has been brought near
 FAILURES = (ValueError, ArithmeticError, np.linalg.LinAlgError)  # by which a refit says that it has no result
@@ -311,23 +312,28 @@ def _swings_of(found: Fit, c: Candidate) -> dict[tuple[str, ...], float]:
         if any(v.name == own.name for own in c.variables):
             places.setdefault(v.keys, []).append(i)
     x, covariance = np.asarray(found.estimate, float), np.asarray(found.covariance, float)
+    if c.variables[0].parameter.neutral == 1:  # factors, of which nobody may know the scale: relative to their mean
+        x, covariance = np.log(np.maximum(x, TINY)), covariance / np.outer(np.maximum(x, TINY), np.maximum(x, TINY))
     return {keys: _spread(x[own], covariance[np.ix_(own, own)]) for keys, own in places.items()}
 
 
 def _spread(x: np.ndarray, covariance: np.ndarray) -> float:
     """Standard deviation of values about their mean, less what their errors make of it: those of a dim light scatter.
-    An error that all share, as of a scale, is none of it. Each value counts by its weight."""
+    An error that all share, as of a scale, is none of it. Each value counts by the variance that it has of both.
+
+    Source: DerSimonian & Laird, Meta-analysis in clinical trials, Control. Clin. Trials 7, 177 (1986)."""
     known = np.isfinite(np.diag(covariance)) & (np.diag(covariance) > 0)
     x, covariance = x[known], covariance[np.ix_(known, known)]
     if len(x) < 2:
         return 0.0
-    weight = np.full(len(x), 1 / len(x))
-    for _ in range(2):  # of the plain mean, then by weights
+    others = np.where(np.eye(len(x), dtype=bool), np.nan, covariance)
+    own, square = np.maximum(np.diag(covariance) - np.nanmedian(others, 0), TINY), 0.0  # less what most share
+    for _ in range(3):
+        weight = 1 / (own + square)
+        weight /= weight.sum()
         about = np.eye(len(x)) - weight
-        expected = np.maximum(np.diag(about @ covariance @ about.T), 1e-30)
-        moved = about @ x
-        weight = (1 / expected) / (1 / expected).sum()
-    return math.sqrt(max(float(weight @ (moved**2 - expected)), 0.0))
+        square = max(float(weight @ ((about @ x) ** 2 - np.diag(about @ covariance @ about.T))), 0.0)
+    return math.sqrt(square)
 
 
 def _from_frame_to_frame(found: Fit, c: Candidate) -> str:
@@ -336,7 +342,7 @@ def _from_frame_to_frame(found: Fit, c: Candidate) -> str:
     p = c.variables[0].parameter
 
     def told(rms: float) -> str:
-        return percent(rms / p.neutral, 2) if p.neutral and p.unit == "1" else f"{rms:.2g}{spaced(p.unit)}"
+        return percent(rms, 2) if p.neutral == 1 else f"{rms:.2g}{spaced(p.unit)}"
 
     ranked = sorted(((rms, keys) for keys, rms in _swings_of(found, c).items()), reverse=True)
     texts = [f"{keys[0].rpartition('.')[0]} {told(rms)}" for rms, keys in ranked]

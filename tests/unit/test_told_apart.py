@@ -829,7 +829,8 @@ def test_lights_that_would_change_more_than_lights_do_explain_nothing(change, le
         row=SimpleNamespace(refit=None, net=1.0),
     )
     found = SimpleNamespace(variables=variables, estimate=[x for own in lights.values() for x in own])
-    found.covariance = np.diag([0.0005**2] * 6) + 0.2**2  # they share a scale that nobody knows
+    gains = np.array(found.estimate)
+    found.covariance = np.diag([0.0005**2] * 6) + 0.2**2 * np.outer(gains, gains)  # a scale that nobody knows
     nets = {"LED drift": 3.0, "gamma": 1.0}
     table = score.Table([drift, gamma], np.eye(7), None, 0.0, nets, nets)
     case, not_tested = SimpleNamespace(table=table), {}
@@ -838,7 +839,7 @@ def test_lights_that_would_change_more_than_lights_do_explain_nothing(change, le
     assert list(not_tested) == [n for n in ("LED drift", "gamma") if n not in left]
     assert list(table.uniform) == list(table.dilated) == left and table.fragile("gamma") == ""
     told = refit.known_of(found, drift)
-    assert told == f"a {100 * np.std(lights['a']):.2g} %, b 0.071 % (rms from frame to frame)"
+    assert told == f"a {100 * np.std(np.log(lights['a'])):.2g} %, b 0.071 % (rms from frame to frame)"
     found.covariance = np.diag([0.001**2] * 3 + [0.1**2] * 3)  # a dim light, whose gains scatter by their errors
     found.estimate = [*lights["a"], 1.08, 0.96, 0.93]
     assert refit.known_of(found, drift).endswith("b 0 % (rms from frame to frame)")
