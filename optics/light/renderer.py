@@ -1036,8 +1036,9 @@ class Renderer:
         return self._tangents[known]
 
     def led_tangent(self, values: Mapping, led: str, key: str, component: int = 0, seed: int = 0) -> np.ndarray:
-        """d / d parameter of one LED's image (of a component of the Stokes vectors), forward mode; rims by central
-        differences where the LED moves."""
+        """d / d parameter of one LED's image (of a component of the Stokes vectors), forward mode; where the LED moves,
+        rims by how its shadows do (optics.light.moving_shadows), of areas and in crowded scenes by central
+        differences."""
         image = self.led(values, led, seed)
         found = self._slopes.setdefault((led, id(image)), (image, {}))[1]
         if key not in found:
