@@ -6,7 +6,7 @@ edge crosses, and in a sum in which they should cancel this rounding is left: of
 two thirds of what images seemed to tell about that lay in ten pixels at rims of shadows, and was not there.
 
 Source: Ramamoorthi, Mahajan & Belhumeur, A first-order analysis of lighting, shading, and shadows, ACM Trans. Graph.
-26, 2 (2007), sec. 5 (derivatives of visibility by the angle of a blocker's edge)."""
+26(1), article 2 (2007): shadows move by the angle at which a blocker's edge is seen."""
 
 from __future__ import annotations
 

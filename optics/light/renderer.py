@@ -18,17 +18,16 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
-from itertools import repeat
+from functools import cached_property
 from types import SimpleNamespace
 
 import numpy as np
 
 from optics.errors import Apart, BadScene
 from optics.light import paths
-from optics.light.moving_shadows import turned
 from optics.light.samples import Finer, Hits, LedImage, Sample, Traced, aligned, around, creases, edges
-from optics.light.together import Group, alike, numbers_of
+from optics.light.slopes import Slopes, board_of, of_light
+from optics.light.together import Group, alike
 from optics.processes import return_memory
 from optics.scene.images import bend, finer_of, from_parts, in_parts, repeated
 from optics.scene.loader import Scene
@@ -52,7 +51,6 @@ PAINTED = 0.05  # of the largest reflectance of a texture: a step from pixel to 
 BENT_SIDE = 4  # finer samples each way where the face bends: the mean of what varies smoothly needs few
 SOFT = 25  # points of a light, above which rims of its shadows take the samples of what bends, BENT_SIDE each way
 R2 = 0.7548776662466927, 0.5698402909980532  # of the R2 sequence: shifts from pixel to pixel
-MOVES = ("light x", "light y", "light z", "light turn")  # roles of a light's parameters that move it
 CORNERS = np.array([[0.5, 0.5], [0.02, 0.02], [0.98, 0.02], [0.02, 0.98], [0.98, 0.98]]).T  # of a pixel
 FLAT_FIELDS = ("multiplicative", "additive", "none")
 MEMORY = 2e9  # bytes of hits, with what images need for their derivatives, that are kept
@@ -187,7 +185,7 @@ class Renderer:
         ]
         self._clocks = {k: told for k in self.shading_keys if (told := self._told_by(k))}
         self.led_keys = {
-            n: [k for k in led_keys if k.rsplit(".", 1)[0] in (n, _board(light)) and k not in self.power_keys]
+            n: [k for k in led_keys if k.rsplit(".", 1)[0] in (n, board_of(light)) and k not in self.power_keys]
             for n, light in scene.lights.items()
         }
         self._fixed = {
@@ -1053,10 +1051,10 @@ class Renderer:
             keys = [key, *others[: at_once - 1]]
             mates = self._mates(values, image, keys, seed)
             try:
-                slopes_of = self._tangents_of(values, image, keys, mates)
+                slopes_of = Slopes(self, image, keys, mates).made(values)
             except Apart:  # of a group alone
                 self.apart = True
-                slopes_of = self._tangents_of(values, image, keys)
+                slopes_of = Slopes(self, image, keys).made(values)
             for mate, slopes in slopes_of.items():
                 self._slopes.setdefault((mate.led, id(mate)), (mate, {}))[1].update(slopes)
             if not self.asked:
@@ -1080,139 +1078,16 @@ class Renderer:
             self.asked = set()
             self._slopes.clear()
 
-    def _moves(self, key: str, lamp) -> bool:
-        """Whether a parameter moves this light."""
-        name, parameter = key.rsplit(".", 1)
-        part = self.scene.parts[name]
-        return name == _board(lamp) or (part is lamp and part.numbers[parameter].role in MOVES)
-
     def _mates(self, values: Mapping, image: LedImage, keys: Sequence[str], seed: int) -> list[LedImage]:
         """The images whose tangents are made with those of an LED's image: of all LEDs that it was made with, where
         they are lit as well and will be asked for the same; [] for none."""
         group, lit = image.group, self.lit(values)
         if self.apart or group is None or not all(name in lit for name in group.names):
             return []
-        wanted = [_of(key, image.led, name) for key in keys for name in group.names]
+        wanted = [of_light(key, image.led, name) for key in keys for name in group.names]
         found = [self._images.get(self._image_key(values, name, seed)) for name in group.names]
         alike = all(mate is not None and mate.group is group for mate in found)
         return found if alike and self.asked.issuperset(wanted) else []
-
-    def _tangents_of(
-        self, values: Mapping, image: LedImage, keys: Sequence[str], mates: Sequence[LedImage] = ()
-    ) -> dict[LedImage, dict[str, tuple]]:
-        """Image -> key -> `_raw` of the derivative of an LED's image; of several that were made together, each by its
-        own LED's parameters."""
-        import drjit as dr
-        import mitsuba as mi
-
-        lamp, group = self.scene.leds[image.led], image.group if mates else None
-        sampled = len(image.index) if group is None else group.finer is not None
-        moving = [k for k in keys if self._moves(k, lamp) and sampled]
-        self.apply(values, move=bool(moving))
-        places = {k: (self.scene.parts[k.rsplit(".", 1)[0]], k.rsplit(".", 1)[1]) for k in keys}
-        own = {k: name for k, (part, name) in places.items() if group is not None and part is lamp}
-
-        def value_of(key):
-            """Of several LEDs, one value for each."""
-            return numbers_of(group.lights, own[key]) if key in own else getattr(*places[key])
-
-        @contextmanager
-        def put(numbers):
-            """Within it parts hold other numbers; gives those that are the LEDs' own."""
-            before = {k: getattr(*places[k]) for k in numbers if k not in own}
-            for k in before:
-                setattr(*places[k], numbers[k])
-            try:
-                yield {own[k]: number for k, number in numbers.items() if k in own}
-            finally:
-                for k, number in before.items():
-                    setattr(*places[k], number)
-
-        def tangents(of, visible, asked):
-            sample, lights = of()
-            attached = {k: mi.Float(dr.detach(value_of(k))) for k in asked}
-
-            def take(light):
-                found = []
-                for value in attached.values():
-                    dr.set_grad(value, 1.0)
-                    found.append(dr.forward_to(light, flags=dr.ADFlag.ClearVertices | dr.ADFlag.AllowNoGrad))
-                    dr.clear_grad(value)
-                    dr.clear_grad(light)
-                return found
-
-            dr.enable_grad(*attached.values())
-            with put(attached) as given:
-                return self._shade_each(sample, lights(given), visible, take)
-
-        def moved(key, of):
-            number = self.scene.parameters[key]
-            step, sides = number.step * number.plausible, []
-            for sign in (1, -1):
-                value = mi.Float(value_of(key) + sign * step)
-                dr.make_opaque(value)
-                with put({key: value}) as given:
-                    sample, lights = of()
-                    sides.append(self._shade(sample, lights(given), self._visible(sample.si, lights(given))))
-            return (sides[0] - sides[1]) / (2 * step)
-
-        straight = bool(moving) and not self.crowded and not lamp.places()
-
-        def speed(key, of):
-            """How far the light moves per unit of a parameter, mm."""
-            value = mi.Float(dr.detach(value_of(key)))
-            dr.enable_grad(value)
-            with put({key: value}) as given:
-                at = of()[1](given).position()
-            dr.set_grad(value, 1.0)
-            return dr.forward_to(at, flags=dr.ADFlag.ClearVertices | dr.ADFlag.AllowNoGrad)
-
-        @cache
-        def shadows(of):
-            sample, lights = of()
-            return turned(self.scene.integrator, self._world(), sample.si, lights({}))
-
-        def shaded_and_moved(of, visible):
-            """Of a point light: how what it lights changes, and what its shadows take where they move."""
-            found = dict(zip(keys, tangents(of, visible, keys)))
-            sample, lights = of()
-            lit, unlit = (self._shade(sample, lights({}), mi.Mask(seen)) for seen in (True, False))
-            for key in moving:
-                v = speed(key, of)
-                found[key] += (lit - unlit) * sum(dr.dot(v, side) * rate for side, rate in shadows(of))
-            return [found[k] for k in keys]
-
-        def rims(of, visible):
-            if straight:
-                return shaded_and_moved(of, visible)
-            still = [k for k in keys if k not in moving]
-            found = dict(zip(still, tangents(of, visible, still))) if still else {}
-            return [found[k] if k in found else moved(k, of) for k in keys]
-
-        def at_centres():
-            return (image.hits.sample, lambda given: lamp) if group is None else (group.centres(), group.at_centres)
-
-        def at_finer():
-            return (image.finer.sample, lambda given: lamp) if group is None else (group.finer, group.at_finer)
-
-        lit = image if group is None else group
-        pixels = image.hits.size * max(len(mates), 1)
-        rays = image.finer.size if group is None else sum(group.sizes)
-        centres: Iterable[np.ndarray] = repeat(np.zeros((pixels, self.bands)))
-        if not self.crowded:
-            made = self._each_band_of(lambda: tangents(at_centres, lit.visible, keys), image.led)
-            centres = [np.broadcast_to(m, (pixels, self.bands)) for m in made]
-        finely: Iterable[np.ndarray | None] = repeat(None)
-        if sampled:
-            made = self._each_band_of(lambda: rims(at_finer, lit.rim_visible), image.led)
-            finely = [np.broadcast_to(m, (rays, self.bands)) for m in made]
-        wide = image.hits.everywhere
-        if group is None:
-            return {image: {k: (wide(c), f) for k, c, f in zip(keys, centres, finely)}}
-        each = zip(*(group.apart(c, f) for c, f in zip(centres, finely)))
-        return {
-            m: {_of(k, image.led, m.led): (wide(c), f) for k, (c, f) in zip(keys, raw)} for m, raw in zip(mates, each)
-        }
 
     def bounced(
         self, values: Mapping, led: str, seed: int = 0, component: int = 0, roughly: bool = False
@@ -1410,22 +1285,10 @@ def _power_of_two(number: float) -> int:
     return 1 << math.ceil(math.log2(number))
 
 
-def _of(key: str, led: str, other: str) -> str:
-    """The key of an LED's own parameter, of another LED; any other key as it is."""
-    name, _, number = key.rpartition(".")
-    return f"{other}.{number}" if name == led else key
-
-
 def _standing(light) -> tuple:
     """All numbers that a light and its board have: what its shadows depend on, and more."""
     board = getattr(light, "board", None)
     return (*light.held.values(), *(board.held.values() if board is not None else ()))
-
-
-def _board(light) -> str:
-    """Name of the board that a light stands on; '' for none."""
-    board = getattr(light, "board", None)
-    return board.name if board is not None else ""
 
 
 def _shift(seed: int) -> np.ndarray:
