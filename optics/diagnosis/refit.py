@@ -305,16 +305,22 @@ def known_of(found: Fit, c: Candidate) -> str:
     return text if "not show" in text else ""
 
 
-def _swings_of(found: Fit, c: Candidate) -> dict[tuple[str, ...], float]:
-    """How much the strengths of single frames vary, of each parameter (`_spread`)."""
-    places: dict[tuple[str, ...], list[int]] = {}
+def _swings_of(found: Fit, c: Candidate) -> list[tuple[float, Variable]]:
+    """How much the strengths of single frames vary (`_spread`), of each parameter, with a variable of it; the largest
+    first."""
+    asked, places = {v.name for v in c.variables}, dict[tuple[str, ...], list[int]]()
     for i, v in enumerate(found.variables):
-        if any(v.name == own.name for own in c.variables):
+        if v.name in asked:
             places.setdefault(v.keys, []).append(i)
-    x, covariance = np.asarray(found.estimate, float), np.asarray(found.covariance, float)
-    if c.variables[0].parameter.neutral == 1:  # factors, of which nobody may know the scale: relative to their mean
-        x, covariance = np.log(np.maximum(x, TINY)), covariance / np.outer(np.maximum(x, TINY), np.maximum(x, TINY))
-    return {keys: _spread(x[own], covariance[np.ix_(own, own)]) for keys, own in places.items()}
+    spreads = []
+    for own in places.values():
+        first = found.variables[own[0]]
+        x, covariance = np.asarray(found.estimate, float)[own], np.asarray(found.covariance, float)[np.ix_(own, own)]
+        if first.parameter.neutral == 1:  # factors, of which nobody may know the scale: relative to their mean
+            x = np.maximum(x, TINY)
+            x, covariance = np.log(x), covariance / np.outer(x, x)
+        spreads.append((_spread(x, covariance), first))
+    return sorted(spreads, key=lambda t: -t[0])
 
 
 def _spread(x: np.ndarray, covariance: np.ndarray) -> float:
@@ -339,15 +345,14 @@ def _spread(x: np.ndarray, covariance: np.ndarray) -> float:
 def _from_frame_to_frame(found: Fit, c: Candidate) -> str:
     """'1.9 % (rms from frame to frame)' of strengths that each frame has for itself, or of each part that has them:
     'led_red 1.9 %, led_blue 0.1 % (rms from frame to frame)', the largest first."""
-    p = c.variables[0].parameter
-
-    def told(rms: float) -> str:
-        return percent(rms, 2) if p.neutral == 1 else f"{rms:.2g}{spaced(p.unit)}"
-
-    ranked = sorted(((rms, keys) for keys, rms in _swings_of(found, c).items()), reverse=True)
-    texts = [f"{keys[0].rpartition('.')[0]} {told(rms)}" for rms, keys in ranked]
-    text = ", ".join(texts[:SEVERAL]) + (f" and {len(texts) - SEVERAL} more less" if len(texts) > SEVERAL else "")
-    return f"{told(ranked[0][0]) if len(ranked) == 1 else text} (rms from frame to frame)" if ranked else ""
+    ranked = _swings_of(found, c)
+    parts = [v.keys[0].rpartition(".")[0] for _, v in ranked]
+    texts = []
+    for (rms, v), part in zip(ranked, parts):
+        of = "" if len(ranked) == 1 else f"{part} " if parts.count(part) == 1 else f"{v.keys[0]} "
+        texts.append(of + (percent(rms, 2) if v.parameter.neutral == 1 else f"{rms:.2g}{spaced(v.parameter.unit)}"))
+    more = f", {len(texts) - SEVERAL} others less" if len(texts) > SEVERAL else ""
+    return f"{', '.join(texts[:SEVERAL])}{more} (rms from frame to frame)" if texts else ""
 
 
 def swings(found: Fit, c: Candidate) -> float:
@@ -355,7 +360,7 @@ def swings(found: Fit, c: Candidate) -> float:
     standard deviation. 0 for other effects."""
     if c.effect.scope != "frame" or c.effect.per == "kind":
         return 0.0
-    return max(_swings_of(found, c).values(), default=0.0) / float(c.plausible[0])
+    return max((rms / v.parameter.plausible for rms, v in _swings_of(found, c)), default=0.0)
 
 
 def clear(found: Fit, c: Candidate, strength: Sequence[float]) -> float:

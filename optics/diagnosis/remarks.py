@@ -17,7 +17,7 @@ from optics.diagnosis.fingerprints import NO_DRAFT
 from optics.diagnosis.refit import Case
 from optics.diagnosis.result import NAMED, Basis, Condition, Shift, Split
 from optics.diagnosis.score import KAPPA, Table
-from optics.diagnosis.shared_noise import wander_of
+from optics.diagnosis.shared_noise import is_a_gain, wander_of
 from optics.diagnosis.text import AT_FAULT, leaves_misfit, left_of, moved_by
 from optics.diagnosis.thresholds import CLEAR, EXCESS, LEVEL
 from optics.fit.model import value_of
@@ -243,7 +243,7 @@ def lamp_text(case: Case, outcome: Outcome, basis: Basis) -> str:
     share = best.gain * outcome.scale / max(basis.chi2 - basis.dof, 1.0)
     if not share > SWUNG:
         return ""
-    names = [c.effect.name for c in case.table.order if c.effect.scope == "frame" and c.effect.per == "kind"]
+    names = [c.effect.name for c in case.table.order if is_a_gain(c)]
     more = f" If no lamp did that, add {some(names)} and diagnose again." if names else ""
     swing = percent(wander_of(case, outcome, best))
     frames = "Besides, whole frames" if best.members else "Whole frames"

@@ -39,7 +39,7 @@ def expected_gain(case: Case, members: Sequence[Candidate], scale: float) -> flo
     return case.lamp.about(np.concatenate([b.r for b in evidence.blocks]), columns).noise(scale).gain
 
 
-def _is_a_gain(c: Candidate) -> bool:
+def is_a_gain(c: Candidate) -> bool:
     """Whether an effect has one strength for each frame as a whole."""
     return c.effect.scope == "frame" and c.effect.per == "kind"
 
@@ -47,7 +47,7 @@ def _is_a_gain(c: Candidate) -> bool:
 def bound_wander(case: Case, trials: Iterable[Trial]) -> None:
     """Where effects leave nothing, a lamp that swings as nobody would let it is no rival of theirs; nor is it of images
     where no effect may have a strength for each frame, as where captures state that exposures are the same."""
-    alike = not case.evidence.is_table and not any(_is_a_gain(c) for c in case.table.order)
+    alike = not case.evidence.is_table and not any(is_a_gain(c) for c in case.table.order)
     most = NOTICED if alike or any(t.members and t.complete for t in trials) else math.inf
     if case.evidence.is_table:
         case.session.most = most

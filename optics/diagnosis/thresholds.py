@@ -41,8 +41,9 @@ STRENGTH = 2.0  # standard deviations of a claimed strength from none: a fall wi
 # leaves structure where the base had run to the end of its own: falls are counted from a base that failed then, and all
 # that brings it back seems to be missing.
 IMPOSSIBLE = 36.0
-# Plausible sizes (rms of 2 %) by which the power of one LED changes from frame to frame, at most: more than warming and
-# supplies do. What differs by more lies in how the LEDs light the skin, and gains of each LED follow any of it.
+# Plausible sizes, of 2 % each, by which the power of one LED may change from frame to frame (rms). A red one loses
+# about 1 % for each degree, and frames of a session differ by less than ten. On a real DIGIT, gains of each LED that
+# followed errors of the shading came to 28.
 SWINGING = 5.0
 FAR = 0.3  # misfit over the mean signal: more than the effects of a sensor leave
 # Misfit over the mean signal of the fixed pattern alone in a good sensor (optics.proof, clutter 1), whose coating adds

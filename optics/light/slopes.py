@@ -25,8 +25,8 @@ class Slopes:
     """Of the image of an LED by the parameters `keys`; of several that were made together, `mates`, each by its own
     LED's parameters.
 
-    moving   the parameters that move the light, and with it shadows at the finer samples
-    straight whether it is a point that is seen straight, whose shadows move as optics.light.moving_shadows has it
+    moving    the parameters that move the light, and with it shadows at the finer samples
+    straight  whether it is a point that is seen straight, whose shadows move as optics.light.moving_shadows has it
     """
 
     def __init__(self, renderer: Renderer, image: LedImage, keys: Sequence[str], mates: Sequence[LedImage] = ()):

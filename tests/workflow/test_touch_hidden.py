@@ -14,6 +14,7 @@ from optics.diagnosis.fixed_values import kept_values
 from optics.proof.cells import Cell
 from optics.proof.rigs.touch import Digit
 from optics.study import loop
+from optics.study.setup import effect_variables
 
 # hidden effect: (strength, its look-alikes; relative error allowed: four standard errors, and what the maker's own
 # law differs by)
@@ -81,6 +82,12 @@ def test_one_light_that_changes_is_told_from_all(effect, tmp_path):
     without = [e.name for e in loop.candidates(model, study) if e.name not in tested]
     found = loop.examine(study, model, setup, fit, advised=False, without=without)
     assert found.word == "CLAIM" and found.missing == effect, found.sentence
+    drift, kept = model.scene.registry.find_effect("LED drift"), model.captures
+    for stated, left in ((["led_red"], {"led_green", "led_blue"}), (list(model.scene.leds), set())):
+        model.captures = replace(kept, parameters={**kept.parameters, **{f"{n}.gain": 1.0 for n in stated}})
+        assert {v.keys[0].partition(".")[0] for v in effect_variables(model, drift)} == left
+        assert (loop.excluded(model, study, []).get("LED drift") is None) is bool(left)
+    model.captures = kept
     lights = list(model.scene.leds) if effect == "LED drift" else ["1"]  # as the maker draws them, in lit frames
     stream = 29 if effect == "LED drift" else 5
     drawn = [np.random.default_rng([1001, f, stream]).standard_normal(len(lights)) for f in fit.frames[:-1]]
