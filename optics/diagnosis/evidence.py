@@ -403,8 +403,6 @@ def measure(
             second = again if noisy else {}
             seconds = layout.images(model, values, frames[1:], seeds[1], noisy)
             if own is not None and other is not None and not np.array_equal(own, other):
-                if model.sampled:  # those that come with derivative images are rough
-                    own, other = (model.predict(values, [frame], s)[0] for s in seeds)
                 evidence.render_noise = _between(own, other, model.noise.variance(prediction), model.usable(frame))
         elif noisy:
             _, second = next(seconds)

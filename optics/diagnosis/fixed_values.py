@@ -77,7 +77,7 @@ def best_of_fixed(case: Case, outcome: Outcome, excess: float) -> FixedValue | N
 
     excess   chi2 of the base less its degrees of freedom; 0 within noise"""
     model = case.model
-    if case.evidence.is_table or not isinstance(model, SceneModel) or model.monte_carlo or model.sampled:
+    if case.evidence.is_table or not isinstance(model, SceneModel) or model.monte_carlo:
         return None
     variables = _acting(case, kept_values(model, case))
     try:

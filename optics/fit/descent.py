@@ -16,7 +16,7 @@ import numpy as np
 from scipy.optimize import lsq_linear
 
 from optics.fit.curvature import own_curvature
-from optics.fit.model import Model, seeds_apart, value_of
+from optics.fit.model import Model, value_of
 from optics.scene.parameter import Values, Variable
 
 REACH = 4.0  # plausible sizes that one step may change a nonlinear parameter: beyond, a light may pass the sensor's rim
@@ -86,20 +86,14 @@ def normal_equations(
     robust: bool = False,
     tick: Callable[[], None] | None = None,
 ) -> Normal:
-    """J'WJ, J'Wr and chi2 of the frames at the values, plus the priors. One derivative image per variable and frame.
-
-    Where predictions have errors of samples, derivative images have others: the root of J'Wr is then where the model
-    fits, and not where the errors that both share are small."""
+    """J'WJ, J'Wr and chi2 of the frames at the values, plus the priors. One derivative image per variable and frame."""
     p = len(variables)
     a, b = np.zeros((p, p)), np.zeros(p)
     index_of = {v.name: i for i, v in enumerate(variables)}
     frame_chi2: list[float] = []
     frame_n: list[int] = []
     rows: list[Rows] = []
-    seed = seeds_apart()[0] if model.sampled else 0
-    for frame, (prediction, images) in zip(frames, model.derivatives(values, variables, frames, seed=seed)):
-        if model.sampled:
-            prediction = model.predict(values, [frame])[0]
+    for frame, (prediction, images) in zip(frames, model.derivatives(values, variables, frames)):
         mask = model.usable(frame)
         scale = np.sqrt(mask / model.variance(values, frame, prediction)).astype(np.float32)
         if robust:

@@ -75,11 +75,6 @@ class Model(Protocol):
         """Whether predictions are Monte Carlo estimates, whose own error `variance` includes."""
         ...
 
-    @property
-    def sampled(self) -> bool:
-        """Whether predictions have errors of samples that matter beside the camera's noise, others for other seeds."""
-        ...
-
     def at(self, values: Values, index: int) -> dict[str, Any]:
         """Every parameter's value in a frame: base <- fitted in all frames <- set in this frame <- fitted in it."""
         ...

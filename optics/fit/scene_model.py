@@ -88,7 +88,6 @@ class SceneModel:
         self.monte_carlo = (
             self.renderer.monte_carlo
         )  # whether predictions are Monte Carlo estimates, whose error `variance` holds
-        self.sampled = self.renderer.crowded
         self.sparing = False  # whether pixels that no frame of a press uses do without finer samples
         self._needed_kept: dict[int, Pixels | None] = {}
         self._edges_kept: dict[int, np.ndarray] = {}
@@ -442,9 +441,8 @@ class SceneModel:
         """Per frame: prediction (H, W, C) in DN and {variable's name: d prediction / d value}, float32.
 
         `secant` gives, by name, a finite step to take from the present value in place of the tangent. Variables that do
-        nothing in a frame are left out of its dictionary. Of another seed than the predictions', images are made of
-        fewer samples: those of light reflected twice where the model has none yet, and all of a crowded scene, whose
-        prediction that comes with them is rough as well."""
+        nothing in a frame are left out of its dictionary. Of another seed than the predictions', images of light
+        reflected twice are made of fewer samples where the model has none yet."""
         self.check_variables(variables)
         yield from self._made(
             frames, _differentiated, values=values, variables=variables, secant=secant or {}, seed=seed
@@ -533,7 +531,7 @@ class SceneModel:
     def _depends_on_seed(self, now: Mapping, keys: Iterable[str]) -> bool:
         """Whether the derivative image by these keys is another for another seed."""
         second = self.renderer.bounce_key
-        return self.monte_carlo or self.sampled or bool(second and (now[second] or second in keys))
+        return self.monte_carlo or bool(second and (now[second] or second in keys))
 
     def _keep_derived(self, key: tuple, image: np.ndarray | None) -> None:
         """Keep a derivative image; None where nothing depends on the variable."""
@@ -652,7 +650,7 @@ class SceneModel:
             if not lit:
                 return None
             # of light that the model does not have yet, a ranking needs but a rough image, twice
-            rough = self.renderer.rough or (seed != 0 and not now[key])
+            rough = seed != 0 and not now[key]
             return factor * sum(
                 power * self.renderer.bounced(now, led, seed, component, rough) for led, power in lit.items()
             )
@@ -680,12 +678,12 @@ class SceneModel:
             return factor * self._difference(now, key, seed, component)
         if own:
             image = (
-                self._difference_led(now, name, key, component, seed)
+                self._difference_led(now, name, key, component)
                 if self.parameters[key].how == "difference"
-                else tangent(now, name, key, component, seed)
+                else tangent(now, name, key, component)
             )
             return factor * (lit[name] * image + self._difference_bounced(now, {name: lit[name]}, key, seed, component))
-        total: Any = sum((power * tangent(now, led, key, component, seed) for led, power in lit.items()), 0.0)
+        total: Any = sum((power * tangent(now, led, key, component) for led, power in lit.items()), 0.0)
         total = total + self._difference_bounced(now, lit, key, seed, component)
         if glows:
             total = total + self._difference_ambient(now, key, component)
@@ -713,7 +711,7 @@ class SceneModel:
             first, second = (self.renderer.radiance({**now, key: value}, seed, component) for value in (low, high))
         return (second - first) / (high - low)
 
-    def _difference_led(self, now: Mapping, led: str, key: str, component: int, seed: int = 0) -> np.ndarray:
+    def _difference_led(self, now: Mapping, led: str, key: str, component: int) -> np.ndarray:
         """Central difference of one LED's image by a parameter of its own. The same parameter of other LEDs, which does
         not show in this image, is moved too where their derivatives are asked for: so all are made at once."""
         number = key.rpartition(".")[2]
@@ -721,7 +719,7 @@ class SceneModel:
         sides = {k: self.parameters[k].sides(now[k]) for k in {key} | mates}
         with self.renderer.in_passing():
             first, second = (
-                self.renderer.image({**now, **{k: ends[n] for k, ends in sides.items()}}, led, component, seed)
+                self.renderer.image({**now, **{k: ends[n] for k, ends in sides.items()}}, led, component)
                 for n in (0, 1)
             )
         low, high = sides[key]
@@ -927,12 +925,8 @@ def _differentiated(
         or model.parameters[k].how == "difference"
         and k.rpartition(".")[0] in model.scene.leds
     }
-    model.renderer.rough = model.sampled and seed != 0
-    try:
-        with model.renderer.asking(tangents):
-            return model._differentiate(values, own, secant, seed, index)
-    finally:
-        model.renderer.rough = False
+    with model.renderer.asking(tangents):
+        return model._differentiate(values, own, secant, seed, index)
 
 
 def _behind(now: Mapping, states: Sequence[Mapping]) -> dict[str, Any]:

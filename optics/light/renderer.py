@@ -18,13 +18,14 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from types import SimpleNamespace
 
 import numpy as np
 
 from optics.errors import Apart, BadScene
 from optics.light import paths
+from optics.light.outlines import Outlines
 from optics.light.samples import Finer, Hits, LedImage, Sample, Traced, aligned, around, creases, edges
 from optics.light.slopes import Slopes, board_of, of_light
 from optics.light.together import Group, alike
@@ -37,12 +38,10 @@ from optics.scene.mitsuba_parts import DEFAULT_VARIANT
 # with 128
 RIM_SAMPLES = 128
 PINHOLE = 1e-9  # mm^2: a pupil smaller than a wavelength across is a point
-CROWDED_SAMPLES = 16  # of a crowded scene, whose pixels nearly all have rims
-# times as many behind a pupil: a mean over pixel and pupil then errs as one over the pixel does without. Of discs 4 px
-# wide, blurred over 0.1 to 0.6 px, 1024 samples leave 0.003 to 0.005 of the step at their rim, where 256 of a sharp one
-# leave 0.004. Errors that grow with the pupil would draw a fit to a smaller one: with 512 for both, 1.43 mm^2 came out
-# as 0.92 +- 0.03
-BEHIND_PUPIL = 4
+# Of a crowded scene, whose pixels nearly all have rims: cells across the radius of a ball, see optics.light.outlines
+CELLS = 10
+CROWD = "crowd"  # the finer samples of its pixels
+BEHIND_PUPIL = 4  # times as many at other edges behind a pupil
 LAYERED_RIM_SAMPLES = 32  # in scenes with layers, whose matrices are multiplied for every sample
 # mm^2: the step by which a pupil's image is made. By 0.5 mm^2 beads 4 px wide change by less than the errors of 64
 # samples: the square of these is six times that of the image. By 2 mm^2 it is less than that
@@ -67,12 +66,10 @@ BOUNCE_RAYS = 2**19
 # The same of a crowded scene, where each pixel is a cell: what its directions miss is noise that no neighbour shares,
 # and lets a fit find the second reflections too weak (by a fifth with 256 per pixel, where powers absorb half of them)
 CROWDED_BOUNCE_RAYS = 2**20
+CROWDED_BOUNCES = 16  # of a pixel, at least; twice as many for each step of `fine`
 BOUNCE_NUMBERS = 10  # of a direction: a place in the cell, a technique, two directions, a point of the light
-# Times fewer directions suffice for how second reflections change, with the same ones on both sides, and times fewer
-# samples of a pixel for how a crowded scene changes. With 64 of them errors are 29 % of the square of a derivative
-# image by a finite layer, 6 % by the distortion, 1 % or less by the camera, the size of beads and how far they sank
+# Times fewer directions suffice for how second reflections change, with the same ones on both sides
 ROUGHLY = 4
-ROUGH_SAMPLES = 64  # of a pixel, below which no fewer are taken
 # Where no frame uses a pixel, times fewer directions, but so many at least: glare brings the mean of many such cells.
 # Of a lens that blurs far, pixels within its reach of a mask get the noise of a few
 ASIDE = 16
@@ -139,16 +136,14 @@ class Renderer:
                 scene.parameters[key] = replace(scene.parameters[key], how="difference", step=1.0)
             key = f"{scene.camera.name}.{scene.camera.named('pupil')}"
             scene.parameters[key] = replace(scene.parameters[key], plausible=CROWDED_PUPIL)
-        self.rough = False  # whether a crowded scene is sampled ROUGHLY: for derivatives
         self.rim_samples = LAYERED_RIM_SAMPLES if self.layered else RIM_SAMPLES
         cell = 1 if FEW_BOUNCES * self.height * self.width <= BOUNCE_RAYS else BOUNCE_CELL
         cells = -(-self.height // cell) * -(-self.width // cell)
         self.bent_side, self.bounce = BENT_SIDE, (cell, _power_of_two(max(BOUNCE_SAMPLES, BOUNCE_RAYS / cells)))
         self.grazing = not self.crowded  # whether second directions are drawn where a level skin meets itself
         if self.crowded:
-            self.rim_samples, self.bent_side = CROWDED_SAMPLES << (self.fine - 1), 2
             rays = CROWDED_BOUNCE_RAYS / (self.height * self.width)
-            self.bounce = 1, _power_of_two(max(CROWDED_SAMPLES << (self.fine - 1), rays))
+            self.bounce = 1, _power_of_two(max(CROWDED_BOUNCES << (self.fine - 1), rays))
         self.wavelengths = np.array(scene.integrator.bands or (540.0,))
         self.remember = remember
         self._transmissions: OrderedDict = OrderedDict()
@@ -304,7 +299,23 @@ class Renderer:
             o, d = self.scene.camera.through(mi.Point2f(*lens), o, d)
         return self.scene.traced.enter(o, d, self.scene.integrator.wavelengths(dr.width(o)))
 
-    def _trace(self, u: np.ndarray, v: np.ndarray, lens: tuple | None = None) -> tuple:
+    def _plain_rays(self, u: np.ndarray, v: np.ndarray, lens: np.ndarray | None = None) -> tuple:
+        """Origins and directions (N, 3) of `_rays`, numpy."""
+        import drjit as dr
+        import mitsuba as mi
+
+        with dr.suspend_grad():
+            o, d, _ = self._rays(
+                mi.Float(aligned(u)),
+                mi.Float(aligned(v)),
+                None if lens is None else [mi.Float(aligned(a)) for a in lens],
+            )
+            dr.eval(o, d)
+        return tuple(np.broadcast_to(np.array(a).T, (len(u), 3)) for a in (o, d))
+
+    def _trace(self, u: np.ndarray, v: np.ndarray, lens: tuple | np.ndarray | None = None, aim=None) -> Sample:
+        """The ends of camera rays through places in px, and on a pupil; aim: (which rays, (origins, directions) ->
+        directions that they take in their place), numpy."""
         import drjit as dr
         import mitsuba as mi
 
@@ -316,6 +327,11 @@ class Renderer:
             u, v = mi.Float(u), mi.Float(v)
             if self.crowded:
                 o, d, weight = self._rays(u, v, None if lens is None else [mi.Float(aligned(a)) for a in lens])
+                if aim is not None:
+                    dr.eval(o, d)
+                    at = mi.UInt32(aligned(aim[0], np.uint32))
+                    own = (np.array(dr.gather(type(a), a, at)).T for a in (o, d))
+                    dr.scatter(d, mi.Vector3f(*(mi.Float(aligned(a)) for a in aim[1](*own).T)), at)
                 si, _, origin = self.scene.integrator.reached(self._world(), o, d)
                 si = self.scene.traced.sharpen(si, origin)
             else:
@@ -337,7 +353,8 @@ class Renderer:
         hits = Hits(self._trace(u, v), self.height, self.width, traced)
         hits.eye = self._eye()
         if self.crowded:
-            hits.edges |= creases(np.where(hits.valid[..., None], hits.normal, 0.0)) | self._parted(values)
+            hits.edges |= self._other_edges(hits, values)
+            hits.outlines = self._outlines(values)
         hits.edges |= self._painted(hits)
         hits.bare = self._bare(hits)
         self._hits[key] = hits
@@ -425,24 +442,20 @@ class Renderer:
         return found
 
     # -- one LED ------------------------------------------------------------------------------------------------------
-    def _led_key(self, values: Mapping, led: str, seed: int = 0) -> tuple:
+    def _led_key(self, values: Mapping, led: str) -> tuple:
         return (
             led,
             self.geometry(values),
             self._shading(values),
             tuple(values[k] for k in self.led_keys[led]),
-            (seed, self.rough) if self.crowded else 0,
         )
 
-    def _image_key(self, values: Mapping, led: str, seed: int = 0) -> tuple:
-        return (*self._led_key(values, led, seed), self.wanted)
+    def _image_key(self, values: Mapping, led: str) -> tuple:
+        return (*self._led_key(values, led), self.wanted)
 
-    def led(self, values: Mapping, led: str, seed: int = 0) -> LedImage:
-        """The image that one LED makes at power 1 by direct light, kept with what its derivatives need.
-
-        seed   of the finer samples of a crowded scene, whose errors in most pixels add up to more than a fit ignores:
-               derivatives by other samples than the prediction's do not follow them"""
-        key = self._image_key(values, led, seed)
+    def led(self, values: Mapping, led: str) -> LedImage:
+        """The image that one LED makes at power 1 by direct light, kept with what its derivatives need."""
+        key = self._image_key(values, led)
         if key in self._images:
             self._images.move_to_end(key)
             return self._images[key]
@@ -454,10 +467,10 @@ class Renderer:
         # moving the geometry costs more than an image: make what will be asked for next
         keys = {led: key}
         for other in sorted(self.together - {led}):
-            own = self._image_key(values, other, seed)
+            own = self._image_key(values, other)
             if own not in self._images and self._plain_key(own) not in self._plain:
                 keys[other] = own
-        found = self._render(hits, list(keys), seed)
+        found = self._render(hits, list(keys))
         for name, own in keys.items():
             self._keep(own, found[name])
         return found[led]
@@ -515,7 +528,7 @@ class Renderer:
             self._plain_bytes -= self._plain.popitem(last=False)[1].nbytes
         return image
 
-    def _render(self, hits: Hits, leds: Sequence[str], seed: int) -> dict[str, LedImage]:
+    def _render(self, hits: Hits, leds: Sequence[str]) -> dict[str, LedImage]:
         """LED -> its image over one geometry; of alike ones at once, where images are small."""
         found: dict[str, LedImage] = {}
         for names in self._alike(hits, leds):
@@ -527,7 +540,7 @@ class Renderer:
                 if images:
                     found.update(images)
                     continue
-            found.update((name, self._render_led(hits, name, seed)) for name in names)
+            found.update((name, self._render_led(hits, name)) for name in names)
         return found
 
     @property
@@ -547,7 +560,7 @@ class Renderer:
         groups += [[name] for name in leds if name not in self.scene.leds]
         return [own[i : i + most] for own in groups for i in range(0, len(own), most)]
 
-    def _render_led(self, hits: Hits, led: str, seed: int = 0) -> LedImage:
+    def _render_led(self, hits: Hits, led: str) -> LedImage:
         if led in self.scene.sources:  # what it sends lies in the weights
             rim = self._joint_rim(hits)
             index = np.flatnonzero(rim)
@@ -557,7 +570,7 @@ class Renderer:
             image.raw = own, (own if len(index) else None)
             return image
         if self.crowded:
-            return self._render_crowded(hits, led, seed)
+            return self._render_crowded(hits, led)
         part = self.scene.leds[led]
         visible = self._unshaded(hits, part)
         seen = self._seen(hits, visible)
@@ -616,10 +629,10 @@ class Renderer:
             image.radiance = self._mix(image, image.raw)
         return found
 
-    def _render_crowded(self, hits: Hits, led: str, seed: int) -> LedImage:
+    def _render_crowded(self, hits: Hits, led: str) -> LedImage:
         """The image of one LED in a crowded scene: finer samples in all pixels, few where no outline is."""
         index = np.arange(hits.valid.size)
-        finer = self._finer(hits, index, np.flatnonzero(~hits.edges.ravel()), seed)
+        finer = self._in_crowd(hits)
         visible = self._visible(finer.sample.si, self.scene.leds[led])
         image = LedImage(led, hits, None, index, finer, None, visible, None)
         image.raw = self._direct(image)
@@ -666,17 +679,17 @@ class Renderer:
         return hits.lit[names][1]
 
     # -- what layers leave of it --------------------------------------------------------------------------------------
-    def image(self, values: Mapping, light: str, component: int = 0, seed: int = 0) -> np.ndarray:
+    def image(self, values: Mapping, light: str, component: int = 0) -> np.ndarray:
         """(H, W, B) what one light makes at power 1, layers and all; (N, 1, B) where `values` hold arrays of readings.
 
         component  of the Stokes vector in the camera's axes; 0: what the camera records, S0 unless its detector
                    prefers a polarization (stage `detector`)
         """
         if not self.layered:
-            key = self._plain_key(self._image_key(values, light, seed))
+            key = self._plain_key(self._image_key(values, light))
             plain = self._plain.get(key)
             if plain is None:
-                lit = self.led(values, light, seed)
+                lit = self.led(values, light)
                 plain = lit.radiance if self.side == 1 else self._plain.get(key)
                 if plain is None:
                     plain = self._keep_plain(key, self._mix(lit, lit.raw, side=self.side))
@@ -771,9 +784,9 @@ class Renderer:
 
     def light(self, values: Mapping, light: str, seed: int = 0, component: int = 0) -> np.ndarray:
         """(H, W, B) what one light makes at its power, by one reflection and by two."""
-        image = self.image(values, light, component, seed)
+        image = self.image(values, light, component)
         if self.bounce_key and values[self.bounce_key]:
-            rough = self.rough or self.roughly
+            rough = self.roughly
             image = image + values[self.bounce_key] * self.bounced(values, light, seed, component, rough)
         return self.powers(values, light) * image
 
@@ -788,51 +801,92 @@ class Renderer:
         plain = {**values, **paths.undetected(self.scene)}
         return np.stack([self.radiance(plain, seed, component) for component in range(4)])
 
-    def _finer(self, hits: Hits, index: np.ndarray, bent: np.ndarray | tuple = (), seed: int = 0) -> Finer:
+    def _finer(self, hits: Hits, index: np.ndarray, bent: np.ndarray | tuple = ()) -> Finer:
         """Finer samples of the pixels `index`; of `bent` among them, where no edge is, fewer."""
-        key = (index.tobytes(), np.asarray(bent).tobytes(), seed, self.rough)
+        key = (index.tobytes(), np.asarray(bent).tobytes())
         if key not in hits.rims:  # only the latest is kept
-            hits.rims = {key: self._in_pixels(index, np.isin(np.arange(len(index)), bent), seed)}
+            hits.rims = {key: self._in_pixels(index, np.isin(np.arange(len(index)), bent))}
         return hits.rims[key]
 
-    def _in_pixels(self, index: np.ndarray, bent: np.ndarray, seed: int = 0) -> Finer:
+    def _in_pixels(self, index: np.ndarray, bent: np.ndarray) -> Finer:
         """A Hammersley set in each pixel, shifted from pixel to pixel: an edge in any direction crosses the samples one
         by one, and not in rows, so that a shadow that moves changes a pixel in small steps. What only bends is smooth:
-        the middles of a square grid. Behind a pupil each sample has a place on it as well. Another seed shifts the
-        sets by another amount."""
-        pupil = self.crowded and self.scene.camera.number(self.scene.camera.named("pupil")) > PINHOLE
-        fewer = max(self.rim_samples // ROUGHLY, min(self.rim_samples, ROUGH_SAMPLES))
-        samples = (fewer if self.rough else self.rim_samples) * (BEHIND_PUPIL if pupil else 1)
-        counts = np.where(bent, self.bent_side**2, samples)
+        the middles of a square grid."""
+        counts, u, v = self._places(index, bent, self.rim_samples, self.bent_side)
+        return Finer(counts, self._trace(u, v) if len(index) else None, (u, v))
+
+    def _places(self, index: np.ndarray, bent: np.ndarray, samples: int, side: int) -> tuple[np.ndarray, ...]:
+        """(n,) samples of each pixel, (N,) each u, v in px: `samples` of a Hammersley set, of `bent` pixels side x side
+        of a grid."""
+        counts = np.where(bent, side**2, samples)
         starts = np.cumsum(counts) - counts
         u, v = np.empty((2, counts.sum()), np.float32)
         rim = starts[~bent, None] + np.arange(samples)
-        middle = starts[bent, None] + np.arange(self.bent_side**2)
-        u[rim], v[rim] = self._at(index[~bent], self._set(index[~bent], samples, seed))
-        u[middle], v[middle] = self._at(index[bent], _grid(self.bent_side))
-        lens = None
-        if pupil:
-            lens = np.full((2, counts.sum()), 0.5, np.float32)
-            lens[:, rim] = _places_on_lens(samples, index[~bent], _shift(seed)[2:])
-        return Finer(counts, self._trace(u, v, lens) if len(index) else None, (u, v))
+        middle = starts[bent, None] + np.arange(side**2)
+        u[rim], v[rim] = self._at(index[~bent], self._set(index[~bent], samples))
+        u[middle], v[middle] = self._at(index[bent], _grid(side))
+        return counts, u, v
 
-    def _parted(self, values: Mapping) -> np.ndarray:
-        """Pixels in whose corners and middle not one body is seen: also those of bodies that no middle sees. And
-        all that are as near to one of these as circles of confusion are wide."""
+    def _other_edges(self, hits: Hits, values: Mapping) -> np.ndarray:
+        """Pixels in which something else than a ball ends or folds: in whose corners and middle not one body is seen
+        behind the balls, also those of bodies that no middle sees, and all that are as near to one of these as circles
+        of confusion are wide; and folds, but for those beside a ball."""
         from scipy.ndimage import maximum_filter
 
         index = np.arange(self.height * self.width)
-        bodies = self._bodies(*self._at(index, CORNERS))
-        parted = (bodies != bodies[:, :1]).any(1).reshape(self.height, self.width)
+        bodies = self._bodies(*self._at(index, CORNERS)).astype(int)
+        ball = (bodies > 0) & (bodies < self.scene.traced.bodies)
+        low, high = (own(np.where(ball, none, bodies), 1) for own, none in ((np.min, 2**62), (np.max, -1)))
+        parted = (high > low).reshape(self.height, self.width)
+        beside = maximum_filter(ball.any(1).reshape(self.height, self.width), 3)
+        folds = creases(np.where(hits.valid[..., None], hits.normal, 0.0)) & ~beside
         camera = self.scene.camera
         area, wide = values[f"{camera.name}.{camera.named('pupil')}"], 0.0
         own = SimpleNamespace(**{n: values[f"{camera.name}.{n}"] for n in camera.numbers})
         v, u = np.mgrid[: self.height, : self.width] + 0.5
-        if area > PINHOLE:
+        if area > PINHOLE and parted.any():
             reach = self._reach()
             wide = max(np.abs(camera.astray(own, u, v, far)).max() for far in (reach.min(), reach.max()))
         # by a pixel at least, so that a small pupil changes no pixel's way of being sampled
-        return maximum_filter(parted, 2 * max(int(np.ceil(wide * np.sqrt(area / np.pi))), 1) + 1)
+        return folds | maximum_filter(parted, 2 * max(int(np.ceil(wide * np.sqrt(area / np.pi))), 1) + 1)
+
+    def _outlines(self, values: Mapping) -> Outlines:
+        """Where in the image the crowds' balls are."""
+        camera, crowds = self.scene.camera, self.scene.traced.crowds
+        area, focus = (values[f"{camera.name}.{camera.named(role)}"] for role in ("pupil", "focus"))
+        pupil = math.sqrt(area / math.pi) if area > PINHOLE else 0.0
+        middles, radii = (np.concatenate([getattr(c, n) for c in crowds]) for n in ("middles", "radii"))
+        return Outlines(self._plain_rays, (self.height, self.width), middles, radii, pupil, focus)
+
+    def _in_crowd(self, hits: Hits) -> Finer:
+        """Finer samples of all pixels of a crowded scene: rays for each part of those that show balls, few where none
+        is, and many where something else ends."""
+        if CROWD not in hits.rims:
+            outlines = hits.outlines
+            side = outlines.cells(CELLS * 2 ** ((self.fine - 1) / 2))
+            shown, others = outlines.shown(side), np.flatnonzero(~outlines.own.ravel())
+            bent, samples = (
+                ~hits.edges.ravel()[others],
+                _power_of_two(side**2) * (BEHIND_PUPIL if outlines.pupil else 1),
+            )
+            counts, *places = self._places(others, bent, samples, max(side // 2, 2))
+            pixel = np.concatenate([np.repeat(others, counts), shown.pixel])
+            order = np.argsort(pixel, kind="stable")
+            u, v = (np.concatenate(own)[order] for own in zip(places, (shown.u, shown.v)))
+            weight = np.concatenate([np.repeat(1 / counts, counts), shown.weight])[order]
+            lens = None
+            if outlines.pupil:
+                lens = np.full((2, len(pixel)), 0.5, np.float32)
+                rim = (np.cumsum(counts) - counts)[~bent, None] + np.arange(samples)
+                lens[:, rim] = _places_on_lens(samples, others[~bent])
+                lens[:, -len(shown.pixel) :] = shown.lens
+                lens = lens[:, order]
+            cut = np.flatnonzero(shown.cut)
+            place = np.argsort(order)[len(pixel) - len(shown.pixel) :]  # where the rays for balls came to stand
+            aim = (place[cut].astype(np.uint32), partial(outlines.aimed, shown, cut)) if len(cut) else None
+            counts = np.bincount(pixel, minlength=hits.valid.size)
+            hits.rims = {CROWD: Finer(counts, self._trace(u, v, lens, aim), (u, v), weight)}
+        return hits.rims[CROWD]
 
     def _reach(self) -> np.ndarray:
         """Distances of the balls from the camera, mm."""
@@ -851,10 +905,10 @@ class Renderer:
             u.shape
         )
 
-    def _set(self, index: np.ndarray, count: int, seed: int = 0) -> tuple[np.ndarray, ...]:
-        """(P, count) places in pixels: a Hammersley set, shifted in each by the R2 sequence and in all by the seed."""
+    def _set(self, index: np.ndarray, count: int) -> tuple[np.ndarray, ...]:
+        """(P, count) places in pixels: a Hammersley set, shifted in each by the R2 sequence."""
         places = np.arange(count, dtype=np.float32) / count, _reversed(count).astype(np.float32)
-        shifts = (((index * shift + own) % 1.0).astype(np.float32) for shift, own in zip(R2, _shift(seed)))
+        shifts = ((index * shift % 1.0).astype(np.float32) for shift in R2)
         return tuple((place + shift[:, None]) % 1.0 for place, shift in zip(places, shifts))
 
     def _at(self, index: np.ndarray, places: tuple) -> tuple[np.ndarray, np.ndarray]:
@@ -1015,29 +1069,29 @@ class Renderer:
         shares = own + [1.0] * self.bands
         return power * np.array(shares[: self.bands])
 
-    def led_tangent_at_rest(self, values: Mapping, led: str, key: str, component: int = 0, seed: int = 0) -> np.ndarray:
+    def led_tangent_at_rest(self, values: Mapping, led: str, key: str, component: int = 0) -> np.ndarray:
         """`led_tangent`, kept: all frames share the gel at rest."""
         now = tuple(values[k] for k in self.shading_keys)  # also clocks, through which a derivative shows
         known = (
             key,
             component,
             now,
-            *self._led_key(values, led, seed),
+            *self._led_key(values, led),
             *(values[k] for k in self.layer_order),
             self.side,
         )
         if known not in self._tangents:
             with everywhere(self):
-                self._tangents[known] = self.led_tangent(values, led, key, component, seed).astype(np.float32)
+                self._tangents[known] = self.led_tangent(values, led, key, component).astype(np.float32)
             while len(self._tangents) > 8 * len(self.scene.lights):
                 self._tangents.popitem(last=False)
         return self._tangents[known]
 
-    def led_tangent(self, values: Mapping, led: str, key: str, component: int = 0, seed: int = 0) -> np.ndarray:
+    def led_tangent(self, values: Mapping, led: str, key: str, component: int = 0) -> np.ndarray:
         """d / d parameter of one LED's image (of a component of the Stokes vectors), forward mode; where the LED moves,
         rims by how its shadows do (optics.light.moving_shadows), of areas and in crowded scenes by central
         differences."""
-        image = self.led(values, led, seed)
+        image = self.led(values, led)
         found = self._slopes.setdefault((led, id(image)), (image, {}))[1]
         if key not in found:
             # what a surface holds enters by a call of its own, which a graph that is gone through again cannot follow
@@ -1049,7 +1103,7 @@ class Renderer:
                 rays = [sum(image.group.sizes), rays[1] * len(image.group.names)]
             at_once = max(int(AT_ONCE / max(rays)), 1)
             keys = [key, *others[: at_once - 1]]
-            mates = self._mates(values, image, keys, seed)
+            mates = self._mates(values, image, keys)
             try:
                 slopes_of = Slopes(self, image, keys, mates).made(values)
             except Apart:  # of a group alone
@@ -1078,14 +1132,14 @@ class Renderer:
             self.asked = set()
             self._slopes.clear()
 
-    def _mates(self, values: Mapping, image: LedImage, keys: Sequence[str], seed: int) -> list[LedImage]:
+    def _mates(self, values: Mapping, image: LedImage, keys: Sequence[str]) -> list[LedImage]:
         """The images whose tangents are made with those of an LED's image: of all LEDs that it was made with, where
         they are lit as well and will be asked for the same; [] for none."""
         group, lit = image.group, self.lit(values)
         if self.apart or group is None or not all(name in lit for name in group.names):
             return []
         wanted = [of_light(key, image.led, name) for key in keys for name in group.names]
-        found = [self._images.get(self._image_key(values, name, seed)) for name in group.names]
+        found = [self._images.get(self._image_key(values, name)) for name in group.names]
         alike = all(mate is not None and mate.group is group for mate in found)
         return found if alike and self.asked.issuperset(wanted) else []
 
@@ -1291,17 +1345,11 @@ def _standing(light) -> tuple:
     return (*light.held.values(), *(board.held.values() if board is not None else ()))
 
 
-def _shift(seed: int) -> np.ndarray:
-    """(4,) shifts of finer samples, in a pixel and on a pupil; none of the seed 0."""
-    return np.random.default_rng([seed, 41]).random(4) if seed else np.zeros(4)
-
-
-def _places_on_lens(count: int, index: np.ndarray, shift: np.ndarray | tuple = (0.0, 0.0)) -> np.ndarray:
+def _places_on_lens(count: int, index: np.ndarray) -> np.ndarray:
     """(2, P, count) places on the unit square that stand for the pupil, to go with those in pixels: further coordinates
-    of the R4 sequence, which are in step with no other, shifted from pixel to pixel and by `shift`."""
+    of the R4 sequence, which are in step with no other, shifted from pixel to pixel."""
     step = 1 / 1.1673039782614187 ** np.arange(3, 5)  # powers of the root of x^5 = x + 1
-    own = [(np.asarray(index)[:, None] * s * 0.5 + move) % 1.0 for s, move in zip(step, shift)]
-    return np.stack([(np.arange(count) * s + move) % 1.0 for s, move in zip(step, own)])
+    return np.stack([(np.arange(count) * s + np.asarray(index)[:, None] * s * 0.5) % 1.0 for s in step])
 
 
 def _grid(side: int) -> tuple[np.ndarray, np.ndarray]:

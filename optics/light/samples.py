@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from optics.light import paths
+from optics.light.outlines import Outlines
 
 # difference of a pixel's mean normal from that at its middle, above which finer samples are taken: a fifth of a grey
 # level in 200
@@ -65,6 +66,7 @@ class Hits:
         self.shape = (height, width)
         self.size = height * width if traced is None else len(traced.index)
         self.rims: dict = {}
+        self.outlines: Outlines | None = None  # of the balls of a crowded scene
         self.joint: np.ndarray | None = None
         self.lit: dict[tuple[str, ...], tuple] = {}  # what lights see of the pixels' centres, with their numbers then
         self.eye = np.zeros(3)  # where the camera stood
@@ -103,6 +105,7 @@ class Finer:
 
     counts   (n,) of each pixel;   sample   their ends, N in all, or what gives them; None where no pixel has any
     at       their places u, v in px, (N,) each
+    weights  (N,) share of the pixel that each stands for; None: all of a pixel alike
     """
 
     def __init__(
@@ -110,8 +113,9 @@ class Finer:
         counts: np.ndarray,
         sample: Sample | Callable[[], Sample] | None,
         at: tuple[np.ndarray, np.ndarray],
+        weights: np.ndarray | None = None,
     ):
-        self.counts, self._sample, self.at = counts, sample, at
+        self.counts, self._sample, self.at, self.weights = counts, sample, at, weights
         self.size = int(counts.sum())
         self._starts = np.cumsum(counts) - counts
         self._sorted: dict = {}  # side -> which samples lie in which part of a pixel, as weights of their mean
@@ -122,6 +126,8 @@ class Finer:
 
     def mean(self, values: np.ndarray) -> np.ndarray:
         """(n, B) mean in each pixel of values (N, B)."""
+        if self.weights is not None:
+            return np.add.reduceat(values * self.weights[:, None], self._starts)
         return np.add.reduceat(values, self._starts) / self.counts[:, None]
 
     def in_parts(self, values: np.ndarray, side: int, index: np.ndarray, width: int) -> np.ndarray:
@@ -134,8 +140,9 @@ class Finer:
             corner = (index % width)[pixel], (index // width)[pixel]
             column, row = (np.clip(((a - c) * side).astype(int), 0, side - 1) for a, c in zip(self.at, corner))
             part = pixel * side**2 + row * side + column
-            count = np.bincount(part, minlength=len(self.counts) * side**2)
-            weights = coo_array((1 / count[part], (part, np.arange(self.size))), (len(count), self.size)).tocsr()
+            own = np.ones(self.size) if self.weights is None else self.weights
+            count = np.bincount(part, own, minlength=len(self.counts) * side**2)
+            weights = coo_array((own / count[part], (part, np.arange(self.size))), (len(count), self.size)).tocsr()
             self._sorted[side] = weights, count.reshape(-1, side**2, 1) == 0
         weights, empty = self._sorted[side]
         found = (weights @ values).reshape(len(self.counts), side**2, -1)

@@ -22,7 +22,7 @@ XML
     count integer, 1000: number of beads
     seed integer, 0: of the draw
     detail integer, 2: subdivisions of an icosahedron, 1 to 4
-    fine integer, 1: samples of a pixel that has an outline, 16 times 2^(fine - 1); 1 to 6
+    fine integer, 1: 1 to 6; cells of a pixel, 10 across the radius of a bead, and twice as many in all for each step
     places string, drawn: a table of measured places in place of the draw, .csv with the columns x, y, depth and perhaps
         diameter, mm, at rest; `count`, `width`, `length`, `top` and `bottom` then say nothing, nor do `diameter` and
         `spread` beside measured diameters

@@ -152,8 +152,8 @@ def test_presses_share_the_gel_at_rest_whatever_they_are_like(scene):
 
 
 def test_what_shows_under_a_press_alone_leaves_the_gel_at_rest(scene):
-    """Declared of parameters (`when_pressed`), and true: the image at rest is the same to the bit, that of a press is
-    not, but for what only plates of balls show."""
+    """Declared of parameters (`when_pressed`), and true: the image at rest is the same to the bit, that of a press
+    another, but for what only plates of balls show."""
     shape = (int(SMALL["height"]), int(SMALL["width"]), 3)
     frame = Frame("press", np.zeros(shape, np.float32), parameters={"gel.press_depth": 0.8, "gel.stretch": 0.04})
     model = SceneModel(scene, Captures(Path("."), str(scene.path), [frame], noise=Noise(0.1, 1.0, 0.0, 255.0, 0.0)))
@@ -166,5 +166,5 @@ def test_what_shows_under_a_press_alone_leaves_the_gel_at_rest(scene):
         value = 5 * scene.parameters[key].plausible
         assert model.untouched(model.at(Values({key: value}), 0)) == plain
         assert np.array_equal(model.renderer.radiance({**plain, key: value}), at_rest), key
-        same = np.array_equal(model.renderer.radiance({**now, key: value}), pressed)
-        assert same == (key == "gel.shown_between"), key
+        changed = np.abs(model.renderer.radiance({**now, key: value}) - pressed).max() / pressed.max()
+        assert (changed < 1e-7) == (key == "gel.shown_between"), (key, changed)  # the rest is rounding

@@ -200,38 +200,18 @@ def test_light_that_beads_scatter_into_one_another_is_a_stock_path_tracers(tmp_p
     assert np.abs(off).max() < 6 * np.sqrt(np.mean(noise**2)) + 0.01 * more.max()  # rims of meshes with 5120 faces
 
 
-@pytest.fixture(scope="module")
-def errors(mitsuba):
-    """f(values, seed) -> (H, W) by which the green image of a small crowd is off one of 32 times the samples."""
+@pytest.mark.parametrize("area", [0.0, 1.2])
+def test_few_cells_are_nearly_as_good_as_many(area, mitsuba):
+    """The green image of a small crowd, 10 cells across a bead's radius beside 57, without a pupil and with one that
+    blurs outlines over a third of a pixel. Rays that count as what they meet, 16 or 64 of them, were off by 0.011 and
+    0.004."""
     from optics.light.renderer import Renderer
     from optics.scene import loader
 
     size = {"width": 24, "height": 24, "x_fov": 34, "beads": 40, "diameter": 1.2, "field": 11, "top": 0.65}
-    made = []
+    images = []
     for fine in (1, 6):
         defines = {name: str(value) for name, value in {**size, "bottom": 3.85, "fine": fine}.items()}
         scene = loader.load("particle_gel", defines)
-        made.append((Renderer(scene), scene.values()))
-
-    def of(values, seed=0):
-        rough, fine = (renderer.radiance({**start, **values}, seed)[..., 1] for renderer, start in made)
-        return (rough - fine) / fine.max()
-
-    return of
-
-
-@pytest.mark.slow
-def test_another_seed_has_other_errors_at_outlines(errors):
-    """Two seeds are as good as one another and share none of their error; the same seed gives the same image."""
-    one, other = errors({}, 0), errors({}, 1)
-    np.testing.assert_array_equal(one, errors({}, 0))
-    assert 0.7 < np.std(one) / np.std(other) < 1.4
-    assert abs(np.mean(one * other)) < 0.2 * np.std(one) * np.std(other)  # of 576 pixels, nearly all at rims: 0.04
-
-
-@pytest.mark.slow
-def test_behind_a_pupil_outlines_are_sampled_as_well_as_without(errors):
-    """A circle of confusion of a third of a pixel: errors no larger than a sharp image's, by more than a third; with as
-    many samples they would be twice as large."""
-    sharp, soft = (np.std([errors({"camera.pupil_area": area}, seed) for seed in (0, 1, 2)]) for area in (0.0, 1.2))
-    assert soft < 1.35 * sharp, soft / sharp
+        images.append(Renderer(scene).radiance({**scene.values(), "camera.pupil_area": area})[..., 1])
+    assert np.std(images[0] - images[1]) < 0.0012 * images[1].max()

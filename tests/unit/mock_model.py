@@ -63,7 +63,6 @@ class Exact:
     """A model whose predictions have no error of their own, and no geometry: what the mocks of this folder share."""
 
     monte_carlo = False
-    sampled = False
     captures = None
     driven = None  # what a frame sets is a light's power itself
     drives: frozenset[str] = frozenset()

@@ -69,7 +69,7 @@ def test_maker_and_model_agree(rig, made, effect):
     plain = model.predict(Values(built), [1])[0]
     seen = captures.frames[1].image
     if effect is None:
-        # samples of both at rims, 0.09 DN in green, of up to 130; the noise of a frame is 0.7 to 1
+        # the maker's samples at rims, 0.10 DN in green, of up to 130; the noise of a frame is 0.7 to 1
         assert np.std((seen - plain)[..., 1]) < 0.15 and seen[..., 1].max() > 80
         return
     changed = model.predict(Values({**built, **values}), [1])[0]

@@ -32,7 +32,7 @@ class ParticleGel(ImageRig):
         "field": "11",
         "top": "0.65",
         "bottom": "3.85",
-        "fine": "5",
+        "fine": "3",
         "detail": "1",
     }
     held_out = ("press-02",)
