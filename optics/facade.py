@@ -119,7 +119,8 @@ def calibrate(
                 values, effects that it added stay at their strengths, and its definitions and plugins hold. None: the
                 scene's values
     free        key patterns with one value for all frames, such as "led_*.x". Empty: position, axis, lobe and power of
-                every LED, reflectance and roughness of every membrane, and a prior of 30 % on powers
+                every LED, reflectance and roughness of every membrane, and a prior of 30 % on powers; before a crowd of
+                beads also the camera's pose and field of view, with priors of 0.2 mm and 0.5 deg
     per_group   key patterns with a value per group of frames. None: place and depth of each press, with a prior of
                 0.05 mm about what the stage said; []: none
     priors      pattern -> (mean, standard deviation)

@@ -99,7 +99,7 @@ def calibrate(
             metavar="PATTERN",
             help="Parameters to solve for, such as 'led_*.x'. Repeatable. Without it: what the "
             "parts declare as free (an LED's position, axis, lobe and power, a source's power, a membrane's "
-            "reflectance and roughness, ...).",
+            "reflectance and roughness, before a crowd of beads the camera's pose, ...).",
         ),
     ] = None,
     per_group: Annotated[

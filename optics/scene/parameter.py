@@ -14,7 +14,7 @@ from optics.errors import OutOfBounds, UnknownKey
 from optics.words import Reach, spaced
 
 HOW = ("ad", "difference", "image", "layer", "path")
-FREE = ("", "all", "press")
+FREE = ("", "all", "press", "crowd")
 LARGEST = 1e18  # of any number: squares of larger ones overflow in single precision, in which images are computed
 FALL = 10.0  # a linearisation lowers a factor to no less than this part of it: at 0 it would hide everything else
 ROLES = {  # of parameters: what the library turns, sets or solves for, whatever a part calls it
@@ -87,7 +87,8 @@ class Parameter:
     role        what it is to the library, one of ROLES; '' for what only the part itself and effects read
     band        number of the spectral band that it belongs to, from 0; None: of all bands
     free        what a calibration solves for unless its setup says otherwise: 'all' (one value for all frames), 'press'
-                (a value for each group of frames), '' (not)
+                (a value for each group of frames), 'crowd' (one value, where a crowd of balls shows where the camera
+                stands), '' (not)
     prior_sd    standard deviation of the prior about the scene's value that holds where it is free by `free`; None: no
                 prior
     choices     the allowed words, for a parameter that is a choice and not a number; files: endings of files that serve

@@ -43,7 +43,8 @@ class Setup:
                 there are such folders and they are trusted (optics.scene.trust)
     outside     images and tables may lie outside the folder of the captures
     free        key patterns of the parameters to solve for, one value for all frames; empty: position, axis, lobe and
-                power of every LED, reflectance and roughness of every membrane, power of every source
+                power of every LED, reflectance and roughness of every membrane, power of every source, before a crowd
+                of balls the camera's pose and field of view
     per_group   key patterns of parameters with a value per group of frames; None: the press, where groups are given
     priors      pattern -> (mean, standard deviation); a mean of None is the present value
     held_out    names of groups that the calibration does not see; None: one in four, of four or more
@@ -282,7 +283,9 @@ def _every_fourth(model: SceneModel, groups: Mapping[str, Sequence[int]]) -> lis
 # -- what is free ----------------------------------------------------------------------------------------------------
 def default_free(model: SceneModel) -> list[str]:
     """The parameters that parts declare free in all frames, of LEDs, of sources, then of other parts: position, axis,
-    lobe and power of every LED, power of every source, reflectance and roughness of every membrane.
+    lobe and power of every LED, power of every source, reflectance and roughness of every membrane; before a crowd of
+    balls, whose outlines show it, also the camera's pose and field of view where the captures do not state them as
+    known.
 
     Of a light with free powers in single bands, these are free where the scene has several bands, and the power of all
     bands where it has one."""
@@ -290,11 +293,21 @@ def default_free(model: SceneModel) -> list[str]:
     bands = len((scene.integrator.bands if scene.integrator is not None else ()) or (0,))
     keys = []
     for name in dict.fromkeys((*scene.leds, *scene.sources, *scene.parts)):
-        own = [p for p in scene.parts[name].numbers.values() if p.free == "all" and (p.band or 0) < bands]
+        numbers = scene.parts[name].numbers.values()
+        own = [p for p in numbers if p.free == "all" and (p.band or 0) < bands]
         if any(p.role == "band power" for p in own):
             own = [p for p in own if p.role != ("power" if bands > 1 else "band power")]
         keys += [f"{name}.{p.name}" for p in own]
+        if scene.traced is not None:
+            keys += [key for p in numbers if p.free == "crowd" and not stated(model, key := f"{name}.{p.name}")]
     return keys
+
+
+def stated(model: SceneModel, key: str) -> bool:
+    """Whether the captures give the parameter as known: in single frames, or in all without an uncertainty."""
+    captures = model.captures
+    single = any(key in f.parameters or key in f.readings for f in model.frames)
+    return single or (key in captures.parameters and key not in captures.uncertainty)
 
 
 def variables_of_base(model: SceneModel, setup: Setup, frames: Sequence[int]) -> list[Variable]:

@@ -62,6 +62,8 @@ PARAMETERS = (
         plausible=0.5,
         how="difference",
         step=0.8,
+        free="crowd",
+        prior_sd=0.5,
     ),
     *(
         Parameter(
