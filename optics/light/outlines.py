@@ -25,8 +25,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 from scipy.spatial import cKDTree
 
-ON_PUPIL = 6  # places on a pupil each way, at each of which outlines are worked out
-PICKS = 4  # rays for what a cell shows of a ball, from as many of these places
+# Places on a pupil each way, at each of which outlines are worked out: the least, and more for each px of blur. Of
+# beads 5 px wide, blurred over half a pixel and one, errors are then .004 and .006 of the noise's variance
+ON_PUPIL, PER_BLUR, MOST_ON_PUPIL = 3, 2.5, 6
 SMALL = 1e-3  # of a cell: a part that is left to the others
 NEAR = 2e-3  # of a radius: a ray is sent by at least so much beside an outline
 # Of the way from a ball's outline to the middle of what a cut cell shows of it: the light of a ball rises from its
@@ -34,7 +35,7 @@ NEAR = 2e-3  # of a radius: a ray is sent by at least so much beside an outline
 LIMB = 1 / 9
 FEWEST, MOST = 3, 24  # cells of a pixel each way
 HALF = 0.75  # px: half the diagonal of a pixel, and a little
-AT_ONCE = 2_000_000  # cells of balls that are worked out together
+AT_ONCE = 250_000  # cells of balls that are worked out together
 NEWTON = 4  # steps to the place where a middle is seen
 
 Rays = Callable[..., tuple[np.ndarray, np.ndarray]]  # (u, v[, lens]) in px -> origins and unit directions (N, 3)
@@ -79,12 +80,12 @@ class Outlines:
     ):
         self.rays, self.shape, self.middles, self.radii = rays, shape, middles, radii
         self.pupil = pupil
-        middles_of = (np.arange(ON_PUPIL if pupil else 1) + 0.5) / (ON_PUPIL if pupil else 1)
-        self.on_lens = np.stack([a.ravel() for a in np.meshgrid(middles_of, middles_of)]).astype(np.float32)
         index = np.arange(shape[0] * shape[1])
         o, d = rays(index % shape[1] + 0.5, index // shape[1] + 0.5)
         self.pixel, self.ball = (np.zeros(0, int),) * 2
         self.rank = np.zeros(0, int)
+        self.blur = 0.0  # px, the largest of all
+        self.steps: list[np.ndarray] = []  # (N, 3) each, mm beside a ball for a px across and down
         self.radius = np.inf  # px, the median of the balls
         own = np.zeros(len(index), bool)
         seen = np.abs(o).max(1) < 1e6  # beyond the image circle a fisheye has no ray
@@ -96,9 +97,12 @@ class Outlines:
         """(H W,) pixels that show a ball; and the pairs of a pixel and a ball that it shows or may show, pixel by
         pixel from front to back."""
         height, width = self.shape
-        u, v, smallest, largest = _seen_at(o, d, seen, self.shape, self.middles)
+        u, v, self.steps = _seen_at(o, d, seen, self.shape, self.middles)
+        smallest, largest = _sizes(*self.steps)
         away = np.linalg.norm(self.middles - np.median(o[seen], axis=0), axis=1)
-        soft = np.where(self.pupil > 0, self.pupil * np.abs(1 - away / focus) + largest, 0.0)
+        blur = self.pupil * np.abs(1 - away / focus)
+        self.blur = float(np.max(blur / np.maximum(largest, 1e-9)))
+        soft = blur + largest if self.pupil else blur
         reach = np.minimum((self.radii + soft) / np.maximum(smallest, 1e-9) + 1.5, 2.0 * max(self.shape))
         pixels, balls = [], []
         for k in np.flatnonzero(np.isfinite(u) & np.isfinite(v)):
@@ -110,7 +114,7 @@ class Outlines:
         if not pixels:
             return np.zeros(height * width, bool)
         pixel, ball = np.concatenate(pixels), np.concatenate(balls)
-        s, t = _missed(o[pixel], d[pixel], self.middles[ball])
+        s, t, _ = _missed(o[pixel], d[pixel], self.middles[ball])
         room = HALF * largest[ball] + soft[ball]
         shown = (s < self.radii[ball] + room) & (t > 0) & seen[pixel]
         pixel, ball, t = pixel[shown], ball[shown], t[shown]
@@ -132,14 +136,16 @@ class Outlines:
 
     def shown(self, side: int) -> Shown:
         """Rays for the parts of the pixels that show a ball, one for each part of each of `side` x `side` cells in the
-        middle of what the cell shows of it, PICKS behind a pupil: they change as smoothly as outlines move."""
+        middle of what the cell shows of it, and of the pupil's places that it is shown to: they change as smoothly as
+        outlines move."""
         ids, starts = np.unique(self.pixel, return_index=True)
         ends = np.r_[starts[1:], len(self.pixel)]
-        parts, begin = [], 0
+        parts, begin, places = [], 0, _on_pupil(self.blur) if self.pupil else np.full((2, 1), 0.5, np.float32)
         while begin < len(ids):
-            most = max(AT_ONCE // (side**2 * self.on_lens.shape[1]), 1)
+            most = max(AT_ONCE // (side**2 * places.shape[1]), 1)
             stop = max(int(np.searchsorted(ends, starts[begin] + most, side="right")), begin + 1)
-            parts.append(_Cells(self, ids[begin:stop], slice(int(starts[begin]), int(ends[stop - 1])), side).shown())
+            own = slice(int(starts[begin]), int(ends[stop - 1]))
+            parts.append(_Cells(self, ids[begin:stop], own, side, places).shown())
             begin = stop
         if not parts:
             none = np.zeros(0, np.float32)
@@ -158,7 +164,7 @@ class Outlines:
             at = np.flatnonzero((rank >= k) & (first + k < last))
             ball = self.ball[first[at] + k]
             middles, radius = self.middles[ball], self.radii[ball]
-            s, t = _missed(o[at], d[at], middles)
+            s, t, _ = _missed(o[at], d[at], middles)
             wanted = np.where(rank[at] == k, 1 - NEAR, 1 + NEAR) * radius
             wrong = np.flatnonzero((s > wanted) == (rank[at] == k))
             at, away = at[wrong], (wanted[wrong] / np.maximum(s[wrong], 1e-9))[:, None]
@@ -173,31 +179,32 @@ class _Cells:
 
     ids   the pixels' numbers;   own  their pairs
     part_pixel, part_pair   of each part its pixel's place in `ids` and its pair, -1: what is behind all balls
+    places   (2, grids) on the pupil in the unit square
     shares   (parts, grids, side^2) of each cell that belongs to it;   across, down  from the cell's middle to its own,
              in cells
     """
 
-    def __init__(self, outlines: Outlines, ids: np.ndarray, own: slice, side: int):
-        self.width, self.ids, self.side = outlines.shape[1], ids, side
-        self.places = outlines.on_lens
-        grids = self.places.shape[1]
+    def __init__(self, outlines: Outlines, ids: np.ndarray, own: slice, side: int, places: np.ndarray):
+        self.width, self.ids, self.side, self.places = outlines.shape[1], ids, side, places
+        grids = places.shape[1]
         row, column = np.divmod(np.arange(side**2), side)
         u = (ids % self.width)[:, None, None] + (column + 0.5) / side + np.zeros((1, grids, 1))
         v = (ids // self.width)[:, None, None] + (row + 0.5) / side + np.zeros((1, grids, 1))
-        lens = np.broadcast_to(self.places[:, None, :, None], (2, *u.shape)).reshape(2, -1)
-        o, d = (a.reshape(len(ids), -1, 3) for a in outlines.rays(u.ravel(), v.ravel(), lens if grids > 1 else None))
+        lens = np.broadcast_to(places[:, None, :, None], (2, *u.shape)).reshape(2, -1) if outlines.pupil else None
+        o, d = (a.reshape(len(ids), -1, 3) for a in outlines.rays(u.ravel(), v.ravel(), lens))
         pixel, ball = np.searchsorted(ids, outlines.pixel[own]), outlines.ball[own]
-        s, _ = _missed(o[pixel], d[pixel], outlines.middles[ball][:, None])
+        s, _, off = _missed(o[pixel], d[pixel], outlines.middles[ball][:, None])
         radius = outlines.radii[ball][:, None].astype(np.float32)
-        g = ((radius**2 - s**2) / (2 * radius)).reshape(-1, grids, side, side)
-        slopes = [np.gradient(g, axis=axis, edge_order=2) for axis in (-1, -2)]
-        square = np.maximum(slopes[0] ** 2 + slopes[1] ** 2, 1e-24)
-        g -= square / (24 * radius.reshape(-1, 1, 1, 1))  # by which an outline within a cell lies inside its tangent
+        g = (radius**2 - s**2) / (2 * radius)
+        steps = [(step[ball, None] / (side * radius[..., None])).astype(np.float32) for step in outlines.steps]
+        slopes = [sum(a * step[..., k] for k, a in enumerate(off)) for step in steps]  # of g, from cell to cell
+        square = np.maximum(slopes[0] * slopes[0] + slopes[1] * slopes[1], 1e-24)
+        g -= square / (24 * radius)  # by which an outline within a cell lies inside its tangent
         covers, moment = _cut(g, *slopes)
         middle = moment / np.maximum(covers, 1e-6)
         inside = (middle - LIMB * (middle + g) * (covers < 1)) / square  # times the slopes: from the cell's middle
         outside = -moment / np.maximum(1 - covers, 1e-6) / square
-        behind = np.ones((len(ids), grids, side, side), np.float32)
+        behind = np.ones((len(ids), g.shape[1]), np.float32)
         pushed = [np.zeros_like(behind) for _ in slopes]
         moved = [np.zeros_like(covers) for _ in slopes]
         rank = outlines.rank[own]
@@ -217,36 +224,39 @@ class _Cells:
         self.shares, self.across, self.down = (a.reshape(len(order), grids, side**2) for a in joined)
 
     def shown(self) -> Shown:
-        of_cell = self.shares.mean(1)
-        part, cell = np.nonzero(of_cell > SMALL)
-        share = of_cell[part, cell]
-        picks = 1 if self.shares.shape[1] == 1 else PICKS
-        sums = np.cumsum(self.shares[part, :, cell], axis=1)
-        on_lens = np.stack([(sums <= (k + 0.5) / picks * sums[:, -1:]).sum(1) for k in range(picks)], 1).ravel()
-        on_lens = np.minimum(on_lens, sums.shape[1] - 1)
-        part, cell, weight = (np.repeat(a, picks) for a in (part, cell, share / picks))
-        at = self.part_pixel[part]
+        part, cell = np.nonzero(self.shares.mean(1) > SMALL)
+        own = self.shares[part, :, cell]
+        share = own.sum(1)
+        across, down = (np.sum(own * a[part, :, cell], 1) / share for a in (self.across, self.down))
         row, column = np.divmod(cell, self.side)
-        across, down = (np.clip(a[part, on_lens, cell], -0.49, 0.49) for a in (self.across, self.down))
+        at = self.part_pixel[part]
         pixel = self.ids[at]
         return Shown(
             pixel,
-            (pixel % self.width + (column + 0.5 + across) / self.side).astype(np.float32),
-            (pixel // self.width + (row + 0.5 + down) / self.side).astype(np.float32),
-            (weight / np.bincount(at, weight)[at]).astype(np.float32),
+            (pixel % self.width + (column + 0.5 + np.clip(across, -0.49, 0.49)) / self.side).astype(np.float32),
+            (pixel // self.width + (row + 0.5 + np.clip(down, -0.49, 0.49)) / self.side).astype(np.float32),
+            (share / np.bincount(at, share)[at]).astype(np.float32),
             self.part_pair[part],
-            self.shares[part, on_lens, cell] < 1,
-            self.places[:, on_lens],
+            share < own.shape[1],
+            ((own @ self.places.T).T / share).astype(np.float32),
         )
 
 
-def _missed(o: np.ndarray, d: np.ndarray, middles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distance of middles from rays, and how far along these they are beside them."""
+def _missed(o: np.ndarray, d: np.ndarray, middles: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+    """Distance of middles from rays, how far along these they are beside them, and x, y, z from there to them."""
     to = [np.float32(middles[..., k]) - o[..., k] for k in range(3)]
     along = [d[..., k] for k in range(3)]
     t = to[0] * along[0] + to[1] * along[1] + to[2] * along[2]
     off = [a - t * b for a, b in zip(to, along)]
-    return np.sqrt(off[0] * off[0] + off[1] * off[1] + off[2] * off[2]), t
+    return np.sqrt(off[0] * off[0] + off[1] * off[1] + off[2] * off[2]), t, off
+
+
+def _on_pupil(blur: float) -> np.ndarray:
+    """(2, n) places on the pupil, in the unit square, for outlines that are blurred over `blur` px: the middles of a
+    grid. Places that differ from cell to cell go with sides of the pixel, and leave ten times the error."""
+    side = int(np.clip(math.ceil(ON_PUPIL + PER_BLUR * blur), ON_PUPIL, MOST_ON_PUPIL))
+    middles = (np.arange(side) + 0.5) / side
+    return np.stack([a.ravel() for a in np.meshgrid(middles, middles)]).astype(np.float32)
 
 
 def _cut(g: np.ndarray, across: np.ndarray, down: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -267,8 +277,8 @@ def _cut(g: np.ndarray, across: np.ndarray, down: np.ndarray) -> tuple[np.ndarra
 
 def _seen_at(
     o: np.ndarray, d: np.ndarray, seen: np.ndarray, shape: tuple[int, int], middles: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """(u, v) in px where middles are seen, by the rays of all pixels, and the least and most mm of a pixel there.
+) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+    """(u, v) in px where middles are seen, by the rays of all pixels, and what a px across and down is there, mm.
 
     From the pixel that looks most nearly the same way, steps along the images of its neighbours: of windows that bend
     light no closed form is known."""
@@ -277,7 +287,7 @@ def _seen_at(
     to = middles - np.median(o[known], axis=0)
     _, at = cKDTree(d[known]).query(to / np.linalg.norm(to, axis=1, keepdims=True))
     u, v = known[at] % width + 0.5, known[at] // width + 0.5
-    smallest = largest = np.ones(len(middles))
+    steps: list[np.ndarray] = []
     for _ in range(NEWTON):
         column, row = (np.clip(np.nan_to_num(a).astype(int), 0, n - 1) for a, n in ((u, width), (v, height)))
         start = row * width + column
@@ -300,6 +310,12 @@ def _seen_at(
         e = [np.sum(step * (middles - x), axis=1) for step in steps]
         det = np.maximum(a * c - b * b, 1e-30)
         u, v = column + 0.5 + (c * e[0] - b * e[1]) / det, row + 0.5 + (a * e[1] - b * e[0]) / det
-        spread = np.sqrt(((a - c) / 2) ** 2 + b**2)
-        smallest, largest = (np.sqrt(np.maximum((a + c) / 2 + sign * spread, 0.0)) for sign in (-1, 1))
-    return u, v, smallest, largest
+    return u, v, steps
+
+
+def _sizes(across: np.ndarray, down: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The least and most mm of a pixel whose sides are (N, 3) each."""
+    a, b, c = (np.sum(p * q, axis=1) for p, q in ((across, across), (across, down), (down, down)))
+    spread = np.sqrt(((a - c) / 2) ** 2 + b**2)
+    smallest, largest = (np.sqrt(np.maximum((a + c) / 2 + sign * spread, 0.0)) for sign in (-1, 1))
+    return smallest, largest
