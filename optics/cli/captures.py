@@ -3,7 +3,7 @@
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -159,123 +159,33 @@ def import_(
     A folder of scan folders (scan.yaml), of 9DTact (depth_calibration) or of a pack (dataPack.npz) is read as such.
     With --mosaic, read raw frames of a polarization camera. Of hyperspectral images each band becomes a channel, and
     sensitivities.csv says what it sees."""
-    from optics.captures import hyperspectral, importing, raw_frames, scans, translucent
-    from optics.polarization.mosaic import read_mosaic
+    from optics.cli import sources
 
     terminal.quiet, terminal.debug = quiet, debug
-    lengths = {"ball_radius": ball_radius, "mm_per_pixel": mm_per_pixel}
-    check_finite(import_, {**lengths, "black_level": black_level, "system_gain": system_gain, "dark_noise": dark_noise})
-    raw = {
-        "--settings": listed,
-        "--rename": rename,
-        "--scene": scene,
-        "--bits": bits,
-        **({} if scans.is_scan_source(source) else {"--black-level": black_level}),
-        "--system-gain": system_gain,
-        "--dark-noise": dark_noise,
-    }
-    presses: dict[str, Any] = {
+    given = {
         "--circles": circles,
         "--ball-radius": ball_radius,
         "--mm-per-pixel": mm_per_pixel,
-        "--leds": leds,
-        "--every": every,
         "--untouched": untouched,
         "--background": background,
+        "--leds": leds,
+        "--bin": bin,
+        "--every": every,
+        "--heightmap": heightmap,
+        "--mosaic": mosaic,
+        "--settings": listed,
+        "--rename": rename,
+        "--scene": scene,
+        "--bands": bands,
+        "--bits": bits,
+        "--black-level": black_level,
+        "--system-gain": system_gain,
+        "--dark-noise": dark_noise,
     }
-    of_presses = [name for name, value in presses.items() if value is not None]
-    blocks = {} if bin is None else {"bin": bin}
-    shared: dict[str, Any] = {
-        "settings": listed,
-        "bits": bits,
-        **blocks,
-        "black_level": black_level or 0.0,
-        "system_gain": system_gain,
-        "dark_noise": dark_noise,
-        "overwrite": force,
-    }
-    if heightmap and mosaic is not None:
-        raise ValueError("--heightmap, --mosaic: one is for folders of scans, the other for raw frames; leave one out")
-    if heightmap and not scans.is_scan_source(source):
-        raise ValueError(f"--heightmap: for folders of scans ({scans.FILE}) only, and {source} is none; leave it out")
-    if mosaic is None and hyperspectral.is_cube_source(source):
-        if of_presses:
-            raise ValueError(f"{', '.join(of_presses)}: not of hyperspectral images; leave these out")
-        read = hyperspectral.import_cubes(
-            source,
-            output,
-            scene=scene or "digit",
-            rename=pairs(rename, "--rename"),
-            bands=bands,
-            **shared,
-        )
-        _tell(read.folder, read.warnings)
-        return
-    if bands is not None:
-        raise ValueError(f"--bands: for hyperspectral images only, and {source} holds none; leave it out")
-    if mosaic is None and (given := [name for name, value in raw.items() if value is not None]):
-        raise ValueError(
-            f'{", ".join(given)}: for raw frames of a polarization camera only; give --mosaic "90 45 135 0" as well'
-        )
-    if mosaic is not None:
-        if of_presses:
-            raise ValueError(f"{', '.join(of_presses)}: for presses only; leave out --mosaic, or these")
-        read = raw_frames.import_frames(
-            source,
-            output,
-            mosaic=read_mosaic(mosaic),
-            rename=pairs(rename, "--rename"),
-            scene=scene or "polarization_camera",
-            **shared,
-        )
-        _tell(read.folder, read.warnings)
-        return
-    if scans.is_scan_source(source):
-        if of_presses:
-            raise ValueError(f"{', '.join(of_presses)}: scan.yaml says so; leave these out")
-        with terminal.progress() as progress:
-            found = scans.import_scans(
-                source,
-                output,
-                mapped=[n.rstrip("/") for n in heightmap or ()],
-                black_level=black_level,
-                **blocks,
-                overwrite=force,
-                progress=progress,
-            )
-        _tell(found.folder, found.warnings, found.facts["corrections"])
-        return
-    stated: dict[str, Any] = {name: value for name, value in lengths.items() if value is not None}
-    if translucent.is_translucent_source(source):
-        if given := [name for name in of_presses if name not in ("--ball-radius", "--mm-per-pixel")]:
-            raise ValueError(f"{', '.join(given)}: the folder's images say so; leave these out")
-        with terminal.progress() as progress:
-            found = translucent.import_translucent(
-                source, output, **blocks, overwrite=force, progress=progress, **stated
-            )
-        _tell(found.folder, found.warnings, found.facts["corrections"])
-        return
-    options: dict[str, Any] = {"leds": leds or 3, **blocks, "every": every or 1, "overwrite": force, **stated}
-    if background is not None:
-        options["background"] = background
-    if source.suffix == ".npz" or importing.is_pack(source):
-        if given := [name for name in of_presses if name in ("--circles", "--untouched")]:
-            raise ValueError(f"{', '.join(given)}: the pack holds circles and background; leave these out")
-        found = importing.import_taxim(source, output, **options)
-    else:
-        if circles is None:
-            raise ValueError(
-                f"{source}: a folder of images needs --circles CSV with the columns file, center_x_px, center_y_px, "
-                "contact_radius_px"
-            )
-        missing = [n for n, v in (("--ball-radius", ball_radius), ("--mm-per-pixel", mm_per_pixel)) if v is None]
-        if missing:
-            raise ValueError(
-                f"{source}: {' and '.join(missing)} missing: the size of the ball and of a pixel cannot be read off "
-                "circles"
-            )
-        found = importing.import_circles(source, circles, output, untouched=untouched, **options)
-    _tell(found.folder, found.warnings, found.facts["corrections"])
+    check_finite(import_, {flag[2:].replace("-", "_"): value for flag, value in given.items()})
+    with terminal.progress() as progress:
+        found = sources.read(source, output, given, force, progress)
+    _tell(found.folder, found.warnings, getattr(found, "facts", {}).get("corrections", ()))
 
 
 def _tell(folder: Path, warnings: list[str], corrections: Sequence[Mapping[str, str]] = ()) -> None:
