@@ -20,7 +20,7 @@ PRESSES = ("--ball-radius", "--mm-per-pixel", "--leds", "--every", "--background
 class Kind:
     """A kind of source.
 
-    words   in the plural;   takes, needs  options, as they are written
+    words   what it is;   takes, needs  options, as they are written
     read    (source, folder, keywords) -> what an import left; keywords are options without dashes, of those that were
             given, and `overwrite`, `progress`
     """
@@ -50,13 +50,13 @@ def _circles(source: Path, folder: Path, *, circles: Path, **given: Any) -> Any:
     return importing.import_circles(source, circles, folder, **given)
 
 
-FRAMES = Kind("raw frames of a polarization camera", ("--mosaic", *CAMERA), _frames)
-CUBES = Kind("hyperspectral images", ("--bands", *CAMERA), _cubes)
-SCANS = Kind("folders of scans (scan.yaml)", ("--heightmap", "--black-level"), _scans)
-OF_9DTACT = Kind("calibration folders of 9DTact", ("--ball-radius", "--mm-per-pixel"), translucent.import_translucent)
-PACKS = Kind("calibration packs", PRESSES, importing.import_taxim)
+FRAMES = Kind("a folder of raw frames of a polarization camera", ("--mosaic", *CAMERA), _frames)
+CUBES = Kind("a set of hyperspectral images", ("--bands", *CAMERA), _cubes)
+SCANS = Kind("a folder of scans (scan.yaml)", ("--heightmap", "--black-level"), _scans)
+OF_9DTACT = Kind("a calibration folder of 9DTact", ("--ball-radius", "--mm-per-pixel"), translucent.import_translucent)
+PACKS = Kind("a calibration pack", PRESSES, importing.import_taxim)
 IMAGES = Kind(
-    "folders of images of presses",
+    "a folder of images of presses",
     ("--circles", "--untouched", *PRESSES),
     _circles,
     ("--circles", "--ball-radius", "--mm-per-pixel"),
@@ -90,12 +90,12 @@ def read(source: Path, folder: Path, given: Mapping[str, Any], overwrite: bool, 
     kind = kind_of(source, given.get("--mosaic"))
     for flag in given:
         if flag not in (*kind.takes, *EVERYWHERE):
-            others = " and ".join(other.words for other in KINDS if flag in other.takes)
+            others = " or ".join(other.words for other in KINDS if flag in other.takes)
             more = ', or give --mosaic "90 45 135 0" as well' if flag in CAMERA and kind is not SCANS else ""
-            raise ValueError(f"{flag}: for {others}; {source} is read as {kind.words}; leave it out{more}")
+            raise ValueError(f"{flag}: goes with {others}; {source} is read as {kind.words}; leave it out{more}")
     missing = [flag for flag in kind.needs if flag not in given]
     if missing:
         wanted = "; ".join(f"{flag} ({WHY[flag]})" for flag in missing)
-        raise ValueError(f"{source}: is read as {kind.words}, which need {wanted}")
+        raise ValueError(f"{source}: is read as {kind.words}, which needs {wanted}")
     keywords = {flag[2:].replace("-", "_"): value for flag, value in given.items()}
     return kind.read(source, folder, **keywords, overwrite=overwrite, progress=progress)
