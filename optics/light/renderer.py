@@ -865,11 +865,10 @@ class Renderer:
             outlines = hits.outlines
             side = outlines.cells(CELLS * 2 ** ((self.fine - 1) / 2))
             shown, others = outlines.shown(side), np.flatnonzero(~outlines.own.ravel())
-            bent, samples = (
-                ~hits.edges.ravel()[others],
-                _power_of_two(side**2) * (BEHIND_PUPIL if outlines.pupil else 1),
-            )
+            bent = ~hits.edges.ravel()[others]
+            samples = _power_of_two(side**2) * (BEHIND_PUPIL if outlines.pupil else 1)
             counts, *places = self._places(others, bent, samples, max(side // 2, 2))
+            plain = int(counts.sum())
             pixel = np.concatenate([np.repeat(others, counts), shown.pixel])
             order = np.argsort(pixel, kind="stable")
             u, v = (np.concatenate(own)[order] for own in zip(places, (shown.u, shown.v)))
@@ -879,10 +878,10 @@ class Renderer:
                 lens = np.full((2, len(pixel)), 0.5, np.float32)
                 rim = (np.cumsum(counts) - counts)[~bent, None] + np.arange(samples)
                 lens[:, rim] = _places_on_lens(samples, others[~bent])
-                lens[:, -len(shown.pixel) :] = shown.lens
+                lens[:, plain:] = shown.lens
                 lens = lens[:, order]
             cut = np.flatnonzero(shown.cut)
-            place = np.argsort(order)[len(pixel) - len(shown.pixel) :]  # where the rays for balls came to stand
+            place = np.argsort(order)[plain:]  # where the rays for balls came to stand
             aim = (place[cut].astype(np.uint32), partial(outlines.aimed, shown, cut)) if len(cut) else None
             counts = np.bincount(pixel, minlength=hits.valid.size)
             hits.rims = {CROWD: Finer(counts, self._trace(u, v, lens, aim), (u, v), weight)}
