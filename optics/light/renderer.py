@@ -25,7 +25,7 @@ import numpy as np
 
 from optics.errors import Apart, BadScene
 from optics.light import paths
-from optics.light.outlines import Outlines
+from optics.light.outlines import Grain, Outlines
 from optics.light.samples import Finer, Hits, LedImage, Sample, Traced, aligned, around, creases, edges
 from optics.light.slopes import Slopes, board_of, of_light
 from optics.light.together import Group, alike
@@ -40,11 +40,13 @@ RIM_SAMPLES = 128
 PINHOLE = 1e-9  # mm^2: a pupil smaller than a wavelength across is a point
 # Of a crowded scene, whose pixels nearly all have rims: cells across the radius of a ball, see optics.light.outlines
 CELLS = 10
+ABOUT = 0.05  # relative change of the focus below which the blur counts as the same
+MOST_ELSEWHERE = 8  # cells each way of pixels that show no ball, at most; four of them share a ray
 CROWD = "crowd"  # the finer samples of its pixels
 BEHIND_PUPIL = 4  # times as many at other edges behind a pupil
 LAYERED_RIM_SAMPLES = 32  # in scenes with layers, whose matrices are multiplied for every sample
-# mm^2: the step by which a pupil's image is made. By 0.5 mm^2 beads 4 px wide change by less than the errors of 64
-# samples: the square of these is six times that of the image. By 2 mm^2 it is less than that
+# mm^2: the step by which a pupil's image is made. A smaller one changes beads 4 px wide by little more than an image's
+# errors
 CROWDED_PUPIL = 2.0
 PAINTED = 0.05  # of the largest reflectance of a texture: a step from pixel to pixel that needs finer samples
 BENT_SIDE = 4  # finer samples each way where the face bends: the mean of what varies smoothly needs few
@@ -149,6 +151,7 @@ class Renderer:
         self._transmissions: OrderedDict = OrderedDict()
         self._recent: list[paths.Path] = []
         self._hits: OrderedDict = OrderedDict()
+        self._grains: dict[int, Grain] = {}  # by the focus
         self._second: tuple[tuple, tuple] | None = None  # what second directions meet, and of which values
         self._drawn: OrderedDict[tuple, tuple] = OrderedDict()  # places and numbers of these directions
         self._glow: tuple[tuple, LedImage] | None = None  # the image of light that no LED made, and of which values
@@ -346,6 +349,7 @@ class Renderer:
         if key in self._hits:
             self._hits.move_to_end(key)
             return self._hits[key]
+        grain = self._grain(values) if self.crowded else None
         self.apply(values)
         traced = None if wanted is None else wanted.traced
         index = np.arange(self.height * self.width) if traced is None else traced.index
@@ -354,7 +358,7 @@ class Renderer:
         hits.eye = self._eye()
         if self.crowded:
             hits.edges |= self._other_edges(hits, values)
-            hits.outlines = self._outlines(values)
+            hits.outlines, hits.grain = self._outlines(values), grain
         hits.edges |= self._painted(hits)
         hits.bare = self._bare(hits)
         self._hits[key] = hits
@@ -851,20 +855,32 @@ class Renderer:
         return folds | maximum_filter(parted, 2 * max(int(np.ceil(wide * np.sqrt(area / np.pi))), 1) + 1)
 
     def _outlines(self, values: Mapping) -> Outlines:
-        """Where in the image the crowds' balls are."""
+        """Where in the image the crowds' balls are, of the scene as it stands."""
         camera, crowds = self.scene.camera, self.scene.traced.crowds
-        area, focus = (values[f"{camera.name}.{camera.named(role)}"] for role in ("pupil", "focus"))
+        area = values[f"{camera.name}.{camera.named('pupil')}"]
         pupil = math.sqrt(area / math.pi) if area > PINHOLE else 0.0
         middles, radii = (np.concatenate([getattr(c, n) for c in crowds]) for n in ("middles", "radii"))
-        return Outlines(self._plain_rays, (self.height, self.width), middles, radii, pupil, focus)
+        return Outlines(self._plain_rays, (self.height, self.width), middles, radii, pupil)
+
+    def _grain(self, values: Mapping) -> Grain:
+        """How finely a crowd is made, by the scene's own values, so that it is the same for all images; but for the
+        focus, as far as it makes a difference."""
+        camera = self.scene.camera
+        pupil, focus = (f"{camera.name}.{camera.named(role)}" for role in ("pupil", "focus"))
+        about = round(math.log(max(values[focus], 1e-3)) / ABOUT)
+        if about not in self._grains:
+            base = {**self.scene.values(), pupil: math.pi, focus: math.exp(ABOUT * about)}  # a radius of 1 mm
+            self.apply(base)
+            self._grains[about] = self._outlines(base).grain(CELLS * 2 ** ((self.fine - 1) / 2))
+        return self._grains[about]
 
     def _in_crowd(self, hits: Hits) -> Finer:
         """Finer samples of all pixels of a crowded scene: rays for each part of those that show balls, few where none
         is, and many where something else ends."""
         if CROWD not in hits.rims:
             outlines = hits.outlines
-            side = outlines.cells(CELLS * 2 ** ((self.fine - 1) / 2))
-            shown, others = outlines.shown(side), np.flatnonzero(~outlines.own.ravel())
+            shown, others = outlines.shown(hits.grain), np.flatnonzero(~outlines.own.ravel())
+            side = min(hits.grain.cells, MOST_ELSEWHERE)
             bent = ~hits.edges.ravel()[others]
             samples = _power_of_two(side**2) * (BEHIND_PUPIL if outlines.pupil else 1)
             counts, *places = self._places(others, bent, samples, max(side // 2, 2))

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from optics.light import paths
-from optics.light.outlines import Outlines
+from optics.light.outlines import Grain, Outlines
 
 # difference of a pixel's mean normal from that at its middle, above which finer samples are taken: a fifth of a grey
 # level in 200
@@ -66,7 +66,8 @@ class Hits:
         self.shape = (height, width)
         self.size = height * width if traced is None else len(traced.index)
         self.rims: dict = {}
-        self.outlines: Outlines | None = None  # of the balls of a crowded scene
+        self.outlines: Outlines | None = None  # of the balls of a crowded scene, and how finely it is made
+        self.grain: Grain | None = None
         self.joint: np.ndarray | None = None
         self.lit: dict[tuple[str, ...], tuple] = {}  # what lights see of the pixels' centres, with their numbers then
         self.eye = np.zeros(3)  # where the camera stood

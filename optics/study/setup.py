@@ -316,7 +316,7 @@ def variables_of_base(model: SceneModel, setup: Setup, frames: Sequence[int]) ->
     doubts = settings_in_doubt(model, frames)
     priors = dict(setup.priors)
     if not setup.free:
-        own = {k: model.parameters[k].prior_sd for k in default_free(model)}
+        own = {k: model.parameters[k].prior_sd for k in default_free(model) if not _any_of(setup.per_group or (), k)}
         priors = {**{k: (None, sd) for k, sd in own.items() if sd is not None}, **priors}
     per_group = setup.per_group
     if per_group is None:
@@ -331,7 +331,8 @@ def variables_of_base(model: SceneModel, setup: Setup, frames: Sequence[int]) ->
             f"{some(twice, 4)}: free for all frames and for each group at once, which no frame can separate; "
             "allowed: one of --free and --per-group"
         )
-    variables = calibrate.variables_from(model, setup.free or default_free(model), per_group, None, frames)
+    shared = setup.free or [k for k in default_free(model) if not _any_of(setup.per_group or (), k)]
+    variables = calibrate.variables_from(model, shared, per_group, None, frames)
     swept = {v.keys[0] for v in variables for i in v.frames or () if v.keys[0] in model.frames[i].readings}
     if swept:
         raise ValueError(
@@ -349,6 +350,10 @@ def variables_of_base(model: SceneModel, setup: Setup, frames: Sequence[int]) ->
             variables[i] = v.with_prior(*known[0])
     free = {(key, frame) for v in variables for key in v.keys for frame in v.frames or (None,)}
     return variables + [d for d in doubts if not free & {(d.keys[0], frame) for frame in d.frames or (None,)}]
+
+
+def _any_of(patterns: Sequence[str], key: str) -> bool:
+    return any(fnmatch(key, pattern) for pattern in patterns)
 
 
 def _twice(model: SceneModel, free: Sequence[str], per_group: Sequence[str]) -> list[str]:

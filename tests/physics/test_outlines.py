@@ -4,7 +4,7 @@ move."""
 import numpy as np
 import pytest
 
-from optics.light.outlines import Outlines
+from optics.light.outlines import Grain, Outlines
 
 SIDE, FOCAL, FOCUS, PUPIL = 12, 60.0, 16.0, 0.6
 
@@ -75,7 +75,7 @@ def truth(balls):
 def test_shares_of_pixels(balls, truth, side, rms, most):
     """Of the pixels that show a ball; the error falls with the cells. 96 x 96 rays err by 1e-4."""
     outlines = Outlines(rays, (SIDE, SIDE), *balls)
-    found = shares_of(outlines, outlines.shown(side), len(balls[1]))
+    found = shares_of(outlines, outlines.shown(Grain(2.0, 0.0, side)), len(balls[1]))
     error = (found - truth)[truth > 0]
     assert np.sqrt(np.mean(error**2)) < rms and np.abs(error).max() < most
     np.testing.assert_allclose(found.sum(0), 1, atol=1e-5)
@@ -83,8 +83,11 @@ def test_shares_of_pixels(balls, truth, side, rms, most):
 
 def test_shares_behind_a_pupil(balls, truth):
     """Of outlines that are blurred over up to a pixel; sharp ones are off by ten times as much."""
-    outlines = Outlines(rays, (SIDE, SIDE), *balls, PUPIL * np.sqrt(2), FOCUS)
-    found, blurred = shares_of(outlines, outlines.shown(8), len(balls[1])), by_force(balls, lens_side=10, each=16)
+    outlines = Outlines(rays, (SIDE, SIDE), *balls, PUPIL * np.sqrt(2))
+    found, blurred = (
+        shares_of(outlines, outlines.shown(Grain(2.0, 1.0, 8)), len(balls[1])),
+        by_force(balls, lens_side=10, each=16),
+    )
     error, sharp = (np.sqrt(np.mean((a - blurred)[blurred > 0] ** 2)) for a in (found, truth))
     assert error < 0.12 * sharp
 
@@ -92,7 +95,7 @@ def test_shares_behind_a_pupil(balls, truth):
 def test_rays_meet_what_they_are_for(balls):
     """But for a few whose cell is crossed by several outlines."""
     outlines = Outlines(rays, (SIDE, SIDE), *balls)
-    shown = outlines.shown(4)
+    shown = outlines.shown(Grain(2.0, 0.0, 4))
     o, d = (a.copy() for a in rays(shown.u, shown.v))
     meant = np.where(shown.pair < 0, -1, outlines.ball[shown.pair])
     before = np.mean(first_met(o, d, *balls) != meant)
@@ -103,7 +106,7 @@ def test_rays_meet_what_they_are_for(balls):
 
 def test_no_ball_is_seen():
     outlines = Outlines(rays, (SIDE, SIDE), np.array([[0.0, 0.0, -15.0]]), np.array([0.5]))
-    assert not outlines.own.any() and len(outlines.shown(4).pixel) == 0
+    assert not outlines.own.any() and len(outlines.shown(Grain(2.0, 0.0, 4)).pixel) == 0
 
 
 def test_an_image_moves_with_its_camera(mitsuba):

@@ -175,6 +175,8 @@ def test_beads_show_where_the_camera_stands(load):
     stated = {"camera.z": 0.1, "camera.x": 0.2}
     assert pose - set(default_free(model(beads, stated, {"camera.x": 0.1}))) == {"camera.z"}
     assert pose - set(default_free(model(beads, frame={"camera.y": 0.3}))) == {"camera.y"}
+    of_groups = variables_of_base(model(beads), Setup(captures=".", per_group=["camera.x"]), [0])
+    assert {(v.name, v.prior) for v in of_groups if v.keys == ("camera.x",)} == {("camera.x[f]", None)}
     plain = loader.load("gelsight", {"width": "12", "height": "12"})
     assert not pose & set(default_free(model(plain)))
 
