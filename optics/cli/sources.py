@@ -88,11 +88,11 @@ def read(source: Path, folder: Path, given: Mapping[str, Any], overwrite: bool, 
     Raises ValueError for an option that its kind does not take, or that it needs."""
     given = {flag: value for flag, value in given.items() if value is not None}
     kind = kind_of(source, given.get("--mosaic"))
-    for flag in given:
-        if flag not in (*kind.takes, *EVERYWHERE):
-            others = " or ".join(other.words for other in KINDS if flag in other.takes)
-            more = ', or give --mosaic "90 45 135 0" as well' if flag in CAMERA and kind is not SCANS else ""
-            raise ValueError(f"{flag}: goes with {others}; {source} is read as {kind.words}; leave it out{more}")
+    wrong = [flag for flag in given if flag not in (*kind.takes, *EVERYWHERE)]
+    if wrong:
+        what = f"{', '.join(wrong)}: not for {kind.words}, as which {source} is read"
+        more = ', or give --mosaic "90 45 135 0" as well' if kind is IMAGES and set(wrong) <= set(CAMERA) else ""
+        raise ValueError(f"{what}; leave {'these' if wrong[1:] else 'it'} out{more}")
     missing = [flag for flag in kind.needs if flag not in given]
     if missing:
         wanted = "; ".join(f"{flag} ({WHY[flag]})" for flag in missing)

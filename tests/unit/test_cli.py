@@ -511,7 +511,7 @@ def test_a_calibration_folder_of_9dtact_is_known_by_its_layout(tmp_path, capsys)
     assert cli.main(["import", str(tmp_path), "-o", str(tmp_path / "out")]) == 2
     assert "give --ball-radius" in capsys.readouterr().err
     assert cli.main(["import", str(tmp_path), "-o", str(tmp_path / "out"), "--circles", "a.csv"]) == 2
-    assert "--circles: goes with a folder of images of presses; " in capsys.readouterr().err
+    assert "--circles: not for a calibration folder of 9DTact, as which " in capsys.readouterr().err
 
 
 ENDS = {  # words of a shell -> (exit code, what stderr says)
