@@ -188,7 +188,7 @@ REFUSED = {
     "sweep polarizer_bench -o a.png --csv a.png": r"a\.png is named for two outputs",
     "import black --circles black/c.csv --ball-radius 3 --mm-per-pixel 0.05 -o s": "a: every value is black; allowed",
     "import white --circles white/c.csv --ball-radius 3 --mm-per-pixel 0.05 -o s": "a: every value is 255 DN; allowed",
-    "import images --mosaic 90,45,135,0 --every 3 -o s": "--every: for presses only",
+    "import images --mosaic 90,45,135,0 --every 3 -o s": "--every: not for a folder of raw frames",
     "compare stock": "stock.*camera",
 }
 
