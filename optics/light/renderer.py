@@ -152,6 +152,7 @@ class Renderer:
         self._recent: list[paths.Path] = []
         self._hits: OrderedDict = OrderedDict()
         self._grains: dict[int, Grain] = {}  # by the focus
+        self._began = scene.values() if self.crowded else {}
         self._second: tuple[tuple, tuple] | None = None  # what second directions meet, and of which values
         self._drawn: OrderedDict[tuple, tuple] = OrderedDict()  # places and numbers of these directions
         self._glow: tuple[tuple, LedImage] | None = None  # the image of light that no LED made, and of which values
@@ -863,13 +864,13 @@ class Renderer:
         return Outlines(self._plain_rays, (self.height, self.width), middles, radii, pupil)
 
     def _grain(self, values: Mapping) -> Grain:
-        """How finely a crowd is made, by the scene's own values, so that it is the same for all images; but for the
-        focus, as far as it makes a difference."""
+        """How finely a crowd is made, by the values at which the renderer began, so that it is the same for all images;
+        but for the focus, as far as it makes a difference."""
         camera = self.scene.camera
         pupil, focus = (f"{camera.name}.{camera.named(role)}" for role in ("pupil", "focus"))
         about = round(math.log(max(values[focus], 1e-3)) / ABOUT)
         if about not in self._grains:
-            base = {**self.scene.values(), pupil: math.pi, focus: math.exp(ABOUT * about)}  # a radius of 1 mm
+            base = {**self._began, pupil: math.pi, focus: math.exp(ABOUT * about)}  # a radius of 1 mm
             self.apply(base)
             self._grains[about] = self._outlines(base).grain(CELLS * 2 ** ((self.fine - 1) / 2))
         return self._grains[about]
