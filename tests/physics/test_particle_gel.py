@@ -141,6 +141,11 @@ def test_an_image_does_not_depend_on_those_before_it(load):
     after = Renderer(scene)
     after.radiance({**bleached, "dye.bleaching": 0.0, "gel.dye": 2.0, "camera.x_fov": 20.0})  # where beads are large
     np.testing.assert_array_equal(after.radiance(bleached), alone)
+    soft = {**bleached, "camera.pupil_area": 2.0, "camera.focus": 12.0}  # a focus of its own is asked for later
+    after.radiance({**bleached, "camera.x_fov": 25.0})
+    np.testing.assert_array_equal(
+        after.radiance(soft), Renderer(load(beads=300, detail=1, width=40, height=40)).radiance(soft)
+    )
 
 
 SMALL = {"width": 12, "height": 12, "x_fov": 20, "beads": 12, "field": 6, "diameter": 1.2, "top": 0.65, "bottom": 3.85}
