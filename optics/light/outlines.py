@@ -1,4 +1,4 @@
-"""Outlines: which part of each pixel shows which ball of a crowd, to a thousandth, and rays for it.
+"""Outlines: which part of each pixel shows which ball of a crowd, to some thousandths, and rays for it.
 
 Definition
     g = (R^2 - s^2)/(2 R)           s: distance of a ball's middle from a ray; R: its radius; g = 0 on its outline
