@@ -11,7 +11,7 @@ middle of what the cell shows of ball j.
 Where rays go through a lattice of places and each counts as what it meets, a bead that moves changes pixels by jumps of
 one ray. Of a camera of 12 bits that saw 45 beads 5 px wide, 64 rays a pixel left errors of .07 of the noise's variance,
 512 left .008, and a bead that moved changed chi2 by 100 at random, so that no fit found the end of its valley. With 16
-cells errors are .003, and the same as long as nothing moves far.
+cells they are .003, and change smoothly.
 
 Two outlines that cross within one cell are taken as independent there.
 """
@@ -118,10 +118,12 @@ class Plan:
         middles = (np.arange(self.side) + 0.5) / self.side
         return np.stack([a.ravel() for a in np.meshgrid(middles, middles)]).astype(np.float32)
 
-    def together(self) -> Iterator[tuple[np.ndarray, list[np.ndarray]]]:
-        """Numbers of the places, and of the cells in blocks, that share a ray."""
+    def together(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Numbers of the places, and of the cells in blocks (blocks, cells) of as many each, that share a ray."""
+        blocks = _blocks(self.cells, self.blocks)
+        alike = [np.stack([b for b in blocks if len(b) == size]) for size in {len(b) for b in blocks}]
         for places in _blocks(self.side, self.groups):
-            yield places, _blocks(self.cells, self.blocks)
+            yield from ((places, own) for own in alike)
 
 
 def _blocks(side: int, count: int) -> list[np.ndarray]:
@@ -145,9 +147,8 @@ class Outlines:
         o, d = rays(index % shape[1] + 0.5, index // shape[1] + 0.5)
         self.pixel, self.ball, self.rank = (np.zeros(0, int),) * 3
         self.steps: list[np.ndarray] = []  # (N, 3) each, mm beside a ball for a px across and down
-        self.largest = self.blur = np.zeros(
-            len(radii)
-        )  # (N,) mm of a px at a ball, and over which its outline is blurred
+        # (N,) mm of a px at a ball, and over which its outline is blurred
+        self.largest = self.blur = np.zeros(len(radii))
         own = np.zeros(len(index), bool)
         seen = _seen(o)
         if seen.any() and len(radii):
@@ -205,11 +206,10 @@ class Outlines:
             x = starts + t * along
             now = []
             for k in (1, 3):
-                both = there[k] & there[k + 1]
-                step = np.where(there[k], 1, 0)[:, None] * (x[k] - x[0]) - there[k + 1][:, None] * (x[k + 1] - x[0])
-                step = np.where(both[:, None], step, 2 * step)
+                halves = np.where(there[k : k + 2, :, None], [x[k] - x[0], x[0] - x[k + 1]], 0.0)
+                step = halves.sum(0) * np.where(there[k] & there[k + 1], 1, 2)[:, None]  # one of them stands for both
                 now.append(step - np.sum(step * along[0], axis=1, keepdims=True) * along[0])
-            a, b, c = (np.sum(p * q, axis=1) for p, q in ((now[0], now[0]), (now[0], now[1]), (now[1], now[1])))
+            a, b, c = _products(*now)
             e = [np.sum(step * (self.middles - x[0]), axis=1) for step in now]
             det = a * c - b * b
             told = there[0] & (det > 0)
@@ -337,10 +337,7 @@ class _Cells:
 
     def shown(self, plan: Plan) -> Shown:
         """The rays, for each part one for each group of places on the pupil and block of cells."""
-        found = []
-        for places, blocks in plan.together():
-            for size in {len(b) for b in blocks}:
-                found.append(self._from(places, np.stack([b for b in blocks if len(b) == size])))
+        found = [self._from(places, blocks) for places, blocks in plan.together()]
         joined = Shown(*(np.concatenate([getattr(one, f.name) for one in found], axis=-1) for f in fields(Shown)))
         order = np.argsort(joined.pixel, kind="stable")
         joined = Shown(*(getattr(joined, f.name)[..., order] for f in fields(Shown)))
@@ -404,7 +401,12 @@ def _cut(g: np.ndarray, across: np.ndarray, down: np.ndarray) -> tuple[np.ndarra
 
 def _sizes(across: np.ndarray, down: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The least and most mm of a pixel whose sides are (N, 3) each."""
-    a, b, c = (np.sum(p * q, axis=1) for p, q in ((across, across), (across, down), (down, down)))
+    a, b, c = _products(across, down)
     spread = np.sqrt(((a - c) / 2) ** 2 + b**2)
     smallest, largest = (np.sqrt(np.maximum((a + c) / 2 + sign * spread, 0.0)) for sign in (-1, 1))
     return smallest, largest
+
+
+def _products(p: np.ndarray, q: np.ndarray) -> Iterator[np.ndarray]:
+    """(N,) p p, p q, q q of vectors (N, 3)."""
+    return (np.sum(one * other, axis=1) for one, other in ((p, p), (p, q), (q, q)))

@@ -294,26 +294,21 @@ class Renderer:
     def _rays(self, u, v, lens=None):
         """Origins, directions and weights of the camera's rays in a crowded scene, behind its flat interfaces.
 
-        lens   places in the unit square that stand for the pupil (Dr.Jit); None: its middle"""
+        lens   places in the unit square that stand for the pupil, (2, N); None: its middle"""
         import drjit as dr
         import mitsuba as mi
 
         o, d = self.scene.camera.ray(mi.Float(u), mi.Float(v))
         if lens is not None:
-            o, d = self.scene.camera.through(mi.Point2f(*lens), o, d)
+            o, d = self.scene.camera.through(mi.Point2f(*(mi.Float(aligned(a)) for a in lens)), o, d)
         return self.scene.traced.enter(o, d, self.scene.integrator.wavelengths(dr.width(o)))
 
     def _plain_rays(self, u: np.ndarray, v: np.ndarray, lens: np.ndarray | None = None) -> tuple:
         """Origins and directions (N, 3) of `_rays`, numpy."""
         import drjit as dr
-        import mitsuba as mi
 
         with dr.suspend_grad():
-            o, d, _ = self._rays(
-                mi.Float(aligned(u)),
-                mi.Float(aligned(v)),
-                None if lens is None else [mi.Float(aligned(a)) for a in lens],
-            )
+            o, d, _ = self._rays(aligned(u), aligned(v), lens)
             dr.eval(o, d)
         return tuple(np.broadcast_to(np.array(a).T, (len(u), 3)) for a in (o, d))
 
@@ -330,7 +325,7 @@ class Renderer:
                 return Sample(path.si, mi.UnpolarizedSpectrum(1.0), path.origin, path)
             u, v = mi.Float(u), mi.Float(v)
             if self.crowded:
-                o, d, weight = self._rays(u, v, None if lens is None else [mi.Float(aligned(a)) for a in lens])
+                o, d, weight = self._rays(u, v, lens)
                 if aim is not None:
                     dr.eval(o, d)
                     at = mi.UInt32(aligned(aim[0], np.uint32))
@@ -791,8 +786,7 @@ class Renderer:
         """(H, W, B) what one light makes at its power, by one reflection and by two."""
         image = self.image(values, light, component)
         if self.bounce_key and values[self.bounce_key]:
-            rough = self.roughly
-            image = image + values[self.bounce_key] * self.bounced(values, light, seed, component, rough)
+            image = image + values[self.bounce_key] * self.bounced(values, light, seed, component, self.roughly)
         return self.powers(values, light) * image
 
     def radiance(self, values: Mapping, seed: int = 0, component: int = 0) -> np.ndarray:

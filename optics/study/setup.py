@@ -299,11 +299,11 @@ def default_free(model: SceneModel) -> list[str]:
             own = [p for p in own if p.role != ("power" if bands > 1 else "band power")]
         keys += [f"{name}.{p.name}" for p in own]
         if scene.traced is not None:
-            keys += [key for p in numbers if p.free == "crowd" and not stated(model, key := f"{name}.{p.name}")]
+            keys += [key for p in numbers if p.free == "crowd" and not _is_known(model, key := f"{name}.{p.name}")]
     return keys
 
 
-def stated(model: SceneModel, key: str) -> bool:
+def _is_known(model: SceneModel, key: str) -> bool:
     """Whether the captures give the parameter as known: in single frames, or in all without an uncertainty."""
     captures = model.captures
     single = any(key in f.parameters or key in f.readings for f in model.frames)
@@ -315,8 +315,10 @@ def variables_of_base(model: SceneModel, setup: Setup, frames: Sequence[int]) ->
     known with an uncertainty (`settings_in_doubt`)."""
     doubts = settings_in_doubt(model, frames)
     priors = dict(setup.priors)
+    grouped = setup.per_group or ()
+    shared = setup.free or [k for k in default_free(model) if not any(fnmatch(k, p) for p in grouped)]
     if not setup.free:
-        own = {k: model.parameters[k].prior_sd for k in default_free(model) if not _any_of(setup.per_group or (), k)}
+        own = {k: model.parameters[k].prior_sd for k in shared}
         priors = {**{k: (None, sd) for k, sd in own.items() if sd is not None}, **priors}
     per_group = setup.per_group
     if per_group is None:
@@ -331,7 +333,6 @@ def variables_of_base(model: SceneModel, setup: Setup, frames: Sequence[int]) ->
             f"{some(twice, 4)}: free for all frames and for each group at once, which no frame can separate; "
             "allowed: one of --free and --per-group"
         )
-    shared = setup.free or [k for k in default_free(model) if not _any_of(setup.per_group or (), k)]
     variables = calibrate.variables_from(model, shared, per_group, None, frames)
     swept = {v.keys[0] for v in variables for i in v.frames or () if v.keys[0] in model.frames[i].readings}
     if swept:
@@ -350,10 +351,6 @@ def variables_of_base(model: SceneModel, setup: Setup, frames: Sequence[int]) ->
             variables[i] = v.with_prior(*known[0])
     free = {(key, frame) for v in variables for key in v.keys for frame in v.frames or (None,)}
     return variables + [d for d in doubts if not free & {(d.keys[0], frame) for frame in d.frames or (None,)}]
-
-
-def _any_of(patterns: Sequence[str], key: str) -> bool:
-    return any(fnmatch(key, pattern) for pattern in patterns)
 
 
 def _twice(model: SceneModel, free: Sequence[str], per_group: Sequence[str]) -> list[str]:

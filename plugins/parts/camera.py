@@ -47,6 +47,14 @@ from optics.scene.declare import Part
 from optics.scene.mitsuba_parts import Declared
 from optics.scene.parameter import Parameter
 
+POSE = (  # name, unit, limit, what it is, plausible size, which is its prior as well, step
+    ("x", "mm", 100.0, "shift from the nominal pose, right", 0.2, 0.2),
+    ("y", "mm", 100.0, "shift from the nominal pose, down", 0.2, 0.2),
+    ("z", "mm", 100.0, "shift from the nominal pose, forward", 0.2, 0.8),
+    ("pan", "deg", 80.0, "turn about the y axis", 0.5, 0.2),
+    ("tilt", "deg", 80.0, "turn about the x axis", 0.5, 0.2),
+    ("roll", "deg", 180.0, "turn about the z axis", 0.5, 0.8),
+)
 PARAMETERS = (
     Parameter(
         "x_fov",
@@ -96,77 +104,20 @@ PARAMETERS = (
     Parameter(
         "p2", "1", 0.0, (-1.0, 1.0), "tangential distortion", neutral=0.0, plausible=0.005, how="difference", step=0.8
     ),
-    Parameter(
-        "x",
-        "mm",
-        0.0,
-        (-100.0, 100.0),
-        "shift from the nominal pose, right",
-        plausible=0.2,
-        how="difference",
-        step=0.2,
-        free="crowd",
-        prior_sd=0.2,
-    ),
-    Parameter(
-        "y",
-        "mm",
-        0.0,
-        (-100.0, 100.0),
-        "shift from the nominal pose, down",
-        plausible=0.2,
-        how="difference",
-        step=0.2,
-        free="crowd",
-        prior_sd=0.2,
-    ),
-    Parameter(
-        "z",
-        "mm",
-        0.0,
-        (-100.0, 100.0),
-        "shift from the nominal pose, forward",
-        plausible=0.2,
-        how="difference",
-        step=0.8,
-        free="crowd",
-        prior_sd=0.2,
-    ),
-    Parameter(
-        "pan",
-        "deg",
-        0.0,
-        (-80.0, 80.0),
-        "turn about the y axis",
-        plausible=0.5,
-        how="difference",
-        step=0.2,
-        free="crowd",
-        prior_sd=0.5,
-    ),
-    Parameter(
-        "tilt",
-        "deg",
-        0.0,
-        (-80.0, 80.0),
-        "turn about the x axis",
-        plausible=0.5,
-        how="difference",
-        step=0.2,
-        free="crowd",
-        prior_sd=0.5,
-    ),
-    Parameter(
-        "roll",
-        "deg",
-        0.0,
-        (-180.0, 180.0),
-        "turn about the z axis",
-        plausible=0.5,
-        how="difference",
-        step=0.8,
-        free="crowd",
-        prior_sd=0.5,
+    *(
+        Parameter(
+            name,
+            unit,
+            0.0,
+            (-limit, limit),
+            doc,
+            plausible=size,
+            how="difference",
+            step=step,
+            free="crowd",
+            prior_sd=size,
+        )
+        for name, unit, limit, doc, size, step in POSE
     ),
     Parameter(
         "telecentricity",
